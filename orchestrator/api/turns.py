@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 
 
 class Turns:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from fastapi import APIRouter, Response
 
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 
 router = APIRouter(include_in_schema=False)
 _FOLDER = Path(__file__).parent / "static"

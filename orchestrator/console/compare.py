@@ -16,8 +16,8 @@ from orchestrator.console.curves import number
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run, visible_runs
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import nearest
 from shared_store.volume.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus

@@ -28,8 +28,8 @@ from fastapi import Query, Request
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.console.live import Recent
 from orchestrator.console.routing import page_router
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import finite, history_of, sampled

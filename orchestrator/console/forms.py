@@ -18,7 +18,7 @@ from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from orchestrator.console.pages import form_token, render, wants_page
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import Refusal
 from shared_store.contract.error_text import explain, path_of
 

@@ -26,9 +26,9 @@ from orchestrator.console.run_files import File, files_of
 from orchestrator.console.submit_fields import written
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import short_id
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from orchestrator.services.texts import with_texts
 from shared_store.volume.files import DamagedFile

@@ -12,13 +12,13 @@ from orchestrator.api.native import routes
 from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import short_id
 from orchestrator.persistence.models import Job
 from orchestrator.services import clone as clones
 from orchestrator.services import derived_jobs, models
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from orchestrator.services.resume import resume as resume_job
 from orchestrator.services.spec_submission import Changes

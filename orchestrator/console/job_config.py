@@ -11,11 +11,11 @@ from sqlalchemy import select
 
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
+from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.models import Job
 from orchestrator.services import runs
 from orchestrator.services.context import permitted_run
 from orchestrator.services.damaged_rows import reading
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from orchestrator.services.texts import with_texts
 from shared_store.volume.files import DamagedFile

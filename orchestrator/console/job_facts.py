@@ -9,11 +9,11 @@ from typing import Any
 
 from orchestrator.console import words
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import born_at
 from orchestrator.services import runs
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase

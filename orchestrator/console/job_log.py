@@ -15,7 +15,7 @@ from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.live import Event
 from orchestrator.console.routing import page_router
 from orchestrator.control.log_hub import LogHub
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.log_view import Chosen, LogView, Places
 from shared_store.volume.log_windows import LINES_A_WINDOW, Window, first_error, lines_after, lines_before, search

@@ -23,9 +23,9 @@ from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.native.routes import job_detail
 from orchestrator.console.forms import done
 from orchestrator.console.routing import page_router
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.process.tether import start_tied
 

@@ -18,10 +18,10 @@ from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.domain.reasons import short_id
 from orchestrator.services.context import queue_names
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
 from orchestrator.services.stop import stop as stop_jobs
 from shared_store.contract.error_text import counted

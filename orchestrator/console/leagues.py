@@ -21,8 +21,8 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import races as races_of
 from orchestrator.console.tracks import track_names
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
-from orchestrator.services.errors import ClientError
 from shared_store.contract.error_text import counted
 from shared_store.leagues import moment
 from shared_store.races import clock

@@ -21,8 +21,7 @@ from orchestrator.api.http.following import Following, looked_patiently
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.console.pages import session
 from orchestrator.control.store_calls import StoreCalls
-from orchestrator.domain.errors import Unavailable
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError, Unavailable
 from shared_store.volume.files import DamagedFile
 
 INTERVAL = 0.5

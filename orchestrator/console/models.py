@@ -13,7 +13,7 @@ from orchestrator.console.lineage import drawing
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import written
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from shared_store.volume.files import DamagedFile
 
 router = page_router(stored=True)

@@ -16,8 +16,7 @@ from orchestrator.api.http.auth import kind_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.console.forms import Unconfirmed, check_form
 from orchestrator.console.pages import NAVIGATION, failure, wants_page
-from orchestrator.domain.errors import Unavailable
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError, Unavailable
 from shared_store.contract.error_text import explain
 from shared_store.volume.files import DamagedFile
 

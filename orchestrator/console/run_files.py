@@ -16,8 +16,8 @@ from fastapi.responses import StreamingResponse
 
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.console.routing import page_router
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.files import DamagedFile, open_inside
 from shared_store.volume.layout import NAME, Run

@@ -22,10 +22,9 @@ from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import Group, document, filled, groups, races, tasks, written
 from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
 from orchestrator.console.tracks import track_names
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services import permissions
 from orchestrator.services.context import queue_names
-from orchestrator.services.errors import ClientError
 from orchestrator.services.fit import UnknownQueue
 from orchestrator.services.permissions import Operation
 from orchestrator.services.spec_submission import submit_spec

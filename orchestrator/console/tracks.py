@@ -15,7 +15,7 @@ from orchestrator.console.forms import Form, body_of, done, sent_form
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store import tracks as stored
 from shared_store.contract.error_text import nearest

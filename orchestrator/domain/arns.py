@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from orchestrator.control.account import DEFAULT, Account
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 
 _here = DEFAULT
 

@@ -26,6 +26,14 @@ class RequestError(Exception):
     """Of the HTTP answer."""
 
 
+class ClientError(RequestError):
+    """The request can't be carried out as it stands: AWS's ``ClientException``, HTTP 400 (or ``status``)."""
+
+    def __init__(self, message: str, status: int = 400) -> None:
+        super().__init__(message)
+        self.status = status
+
+
 class ApiError(Exception):
     """The controller refused a request; ``status`` is the HTTP status."""
 

@@ -21,7 +21,7 @@ from sqlalchemy.orm import Session
 from orchestrator import machine
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
-from orchestrator.domain.errors import SpecError, Unavailable
+from orchestrator.domain.errors import ClientError, SpecError, Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
 from orchestrator.engines.toolkit.backoff import Backoff
@@ -29,7 +29,6 @@ from orchestrator.persistence.models import Job
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import is_of_earlier_run
 from orchestrator.services.context import Context, Known, with_store
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER, Actor
 from orchestrator.services.spec_submission import submit
 from orchestrator.spec.evaluations import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from shared_store.volume.checkpoints import (
     Checkpoint,
     DamagedCheckpoint,

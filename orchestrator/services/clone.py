@@ -16,14 +16,13 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
 from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
 from orchestrator.services.context import Context, Known, release, using, with_store
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
 from orchestrator.services.sources import with_teacher

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import Job
-from orchestrator.services.errors import ClientError
 
 DAMAGED = "the job's row in the database is damaged"
 

@@ -7,9 +7,8 @@ from typing import Any
 
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.persistence.models import Job
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
 from orchestrator.services.spec_submission import submit_spec

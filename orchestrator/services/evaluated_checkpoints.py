@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import choose, refusal
-from orchestrator.services.errors import ClientError
 from orchestrator.services.racing_tracks import check_names
 from orchestrator.spec.settings import task_config
 from shared_store.races import NO_RACER, key_of, race_changes

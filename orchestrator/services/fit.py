@@ -8,12 +8,11 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import fit_in_queue
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.persistence.models import JobQueue
 from orchestrator.scheduling.fit import Fit
 from orchestrator.services.context import queue_names
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.keys import Key, KeysError, KeyStore, KeyUsageError
 from orchestrator.services.chosen_checkpoints import CONFLICT
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation, Refusal, Shared
 
 T = TypeVar("T")

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any, Literal
 
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.models import RunRecord
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import owner_of_run, permitted_run, using
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume import models
 from shared_store.volume.bundles import DamagedBundle

@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import named
 from orchestrator.persistence.models import (
     ComputeEnvironment,
@@ -40,7 +41,6 @@ from orchestrator.persistence.models import (
     SchedulingPolicy,
 )
 from orchestrator.persistence.own_models import LogGroup
-from orchestrator.services.errors import ClientError
 
 HIDDEN = "(hidden)"
 """Stands for the value of an environment variable that the caller may not read."""

@@ -6,7 +6,7 @@ from collections.abc import Callable, Hashable, Mapping
 from functools import partial
 from typing import Any
 
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from orchestrator.spec.settings import task_config
 from shared_store.leagues import LeagueError, digest_of_track
 from shared_store.volume.layout import Store

@@ -9,9 +9,9 @@ from typing import Any
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.retention import RunNeeded
 from orchestrator.control.retention_looks import Place, Whose
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.retention import age_of
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume import contents
 

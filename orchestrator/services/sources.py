@@ -10,12 +10,12 @@ from functools import partial
 from typing import Any, TypeVar
 
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.services.context import Context, archived, permitted_run, release
-from orchestrator.services.errors import ClientError
 from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.permissions import Operation
 from orchestrator.services.racing_tracks import check_tracks

@@ -12,6 +12,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.arns import definition_arn
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec, gang_needs
 from orchestrator.engines.registry import FRESH
@@ -19,7 +20,6 @@ from orchestrator.persistence.models import Job, JobQueue
 from orchestrator.services import definitions, submission
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, with_store
-from orchestrator.services.errors import ClientError
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import Actor, JobsOf, Operation
 from orchestrator.services.racing_tracks import check_tracks

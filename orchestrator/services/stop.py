@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from sqlalchemy import or_
 
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.services.context import Context
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from orchestrator.control.kept_texts import references_of
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import now
 from orchestrator.persistence.own_models import KeptText
 from orchestrator.services.context import Context
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor
 from shared_store.volume.layout import Run
 from shared_store.volume.texts import Reference, TextError, beside, read, references, resolved_spec

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -37,7 +38,7 @@ LAYERS = {
     "home": {"domain"},
     "keys": {"domain"},
     "client": {"domain", "home"},
-    "server": {"domain", "engines", "persistence", "control", "api", "console", "home", "keys"},
+    "server": {"domain", "engines", "persistence", "control", "services", "api", "console", "home", "keys"},
     "cli": {"domain", "spec", "engines", "control", "client", "home", "keys", "server", "service_manager"},
 }
 """What each room of the orchestrator may import beside itself."""
@@ -138,3 +139,50 @@ def test_no_module_is_too_long_to_be_seen_whole() -> None:
     for package in (*FORBIDDEN, "tests", "benchmarks"):
         for module in (REPOSITORY / package).rglob("*.py"):
             assert len(module.read_text().splitlines()) <= 450, module
+
+
+WORKER_FLOORS = (
+    {"settings"},
+    {"node"},
+    {"simulation"},
+    {"tasks.declare"},
+    {"tasks.terms"},
+    {"tasks.compile"},
+    {"tasks.run"},
+    {"tasks.library", "tasks"},
+    {"learning"},
+    {"evaluation"},
+    {"deploy"},
+    {"telemetry"},
+)
+"""Rooms of the worker, each of which imports those before it; modules at the root are entries."""
+ENTRIES_OF_WORKER = {
+    *("aws_node", "bitwise_diff", "checkpoint_writer", "evaluate", "export", "race", "record", "render"),
+    *("repeat_incident", "robot", "slurm_node", "supervisor", "track", "train"),
+}
+STORE_FLOORS = ({"process"}, {"contract"}, {"volume"})
+"""The same of the shared store."""
+
+
+def room_of(parts: tuple[str, ...], rooms: set[str]) -> str:
+    """The room of a module, by the parts of its name behind the package; its own name at the root."""
+    two = ".".join(parts[:2])
+    return two if two in rooms else parts[0] if parts else ""
+
+
+@pytest.mark.parametrize(("package", "floors"), [("worker", WORKER_FLOORS), ("shared_store", STORE_FLOORS)])
+def test_no_import_of_a_room_climbs(package: str, floors: Sequence[set[str]]) -> None:
+    level = {room: number for number, floor in enumerate(floors) for room in floor}
+    for module in (REPOSITORY / package).rglob("*.py"):
+        own = room_of(module.relative_to(REPOSITORY / package).with_suffix("").parts, set(level))
+        for name in imports_of(module):
+            if name.startswith(f"{package}."):
+                other = room_of(tuple(name.split(".")[1:]), set(level))
+                if own in level and other in level:
+                    assert own == other or level[other] < level[own], (module, name)
+
+
+def test_nothing_stands_at_the_root_of_the_worker_that_is_no_entry() -> None:
+    modules = {path.stem for path in (REPOSITORY / "worker").glob("*.py")} - {"__init__"}
+    assert modules == ENTRIES_OF_WORKER
+    assert {path.stem for path in (REPOSITORY / "shared_store").glob("*.py")} == {"__init__"}

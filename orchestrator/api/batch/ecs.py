@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 
 _OF_TASK = {
     **{"executionRoleArn": "executionRoleArn", "taskRoleArn": "jobRoleArn", "volumes": "volumes"},

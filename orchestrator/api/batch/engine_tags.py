@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from orchestrator.control.compute_environments import ENGINE_TAG, engine_named_by, environments_of
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.retention import TAG, rule_of
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.installed import ENGINES, check_tags
 from orchestrator.persistence.models import ComputeEnvironment, JobQueue
 from orchestrator.services.context import Context
-from orchestrator.services.errors import ClientError
 from shared_store.contract.error_text import nearest
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import FARGATE_MEMBERS
-from orchestrator.services.errors import ClientError
 
 FARGATE = "FARGATE"
 _ONLY_FARGATE = FARGATE_MEMBERS[:3]

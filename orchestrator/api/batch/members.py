@@ -9,7 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 
 _REFUSED = {
     "enableExecuteCommand": "is not supported; leave it out",

@@ -18,8 +18,8 @@ from orchestrator.api.batch import compute_environments, definitions, jobs, queu
 from orchestrator.api.batch.service_model import service_model
 from orchestrator.api.http import limits
 from orchestrator.control.reconciler import Reconciler
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import Context, Known, with_store
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from orchestrator.services.sources import with_teacher
 from shared_store.volume.initial_weights import TeacherCopy

@@ -10,8 +10,8 @@ from typing import Any
 from sqlalchemy import Select
 from sqlalchemy.orm import InstrumentedAttribute, Session
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.keyset import behind
-from orchestrator.services.errors import ClientError
 
 
 def page_size(request: dict[str, Any], most: int) -> int:

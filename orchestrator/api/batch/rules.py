@@ -11,9 +11,9 @@ from typing import Any
 from orchestrator.api.batch.ecs import container_name, from_ecs, override_from_ecs
 from orchestrator.api.batch.members import check_consumables, check_members
 from orchestrator.api.http.limits import LARGEST_COMMANDS
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import MOST_NODES, GangSpec, gang_needs, target_nodes
 from orchestrator.domain.native_options import MalformedOptions
-from orchestrator.services.errors import ClientError
 from shared_store.contract.error_text import shown
 from shared_store.contract.node import LEAST_LOG_LIMIT
 

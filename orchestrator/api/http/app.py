@@ -24,8 +24,7 @@ from orchestrator.api.native import routes as native
 from orchestrator.control import monitoring
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.errors import RequestError, Unavailable
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError, RequestError, Unavailable
 from orchestrator.services.permissions import Operation
 from shared_store import __version__
 from shared_store.volume.files import DamagedFile

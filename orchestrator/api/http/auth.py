@@ -31,9 +31,8 @@ from orchestrator.api.http import elsewhere
 from orchestrator.api.http.access import Access, actor_of_key
 from orchestrator.api.http.callers import Caller, user_name
 from orchestrator.api.http.limits import Body, RateLimit
-from orchestrator.domain.errors import RequestError
+from orchestrator.domain.errors import ClientError, RequestError
 from orchestrator.domain.excerpts import LONGEST_ERROR, excerpt
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import BY_LOWER_NAME, Actor, Refusal
 
 log = logging.getLogger("muster.api")

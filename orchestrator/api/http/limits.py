@@ -11,8 +11,8 @@ from typing import Any
 from starlette.requests import ClientDisconnect
 from starlette.types import Message, Receive
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import LARGEST_DEFINITION
-from orchestrator.services.errors import ClientError
 
 LARGEST_BODY = 1 << 20
 """Bytes of any request's body."""

@@ -16,7 +16,7 @@ from orchestrator.api.http.callers import user_name
 from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
 from orchestrator.engines.registry import FRESH
@@ -24,7 +24,6 @@ from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, using, with_store
-from orchestrator.services.errors import ClientError
 from orchestrator.services.models import entered_model, find_model, owner_of_model
 from orchestrator.services.permissions import CONTROLLER, Actor, LeagueOf, Operation
 from orchestrator.services.spec_submission import submit

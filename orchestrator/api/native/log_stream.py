@@ -12,8 +12,8 @@ from orchestrator.api.http.following import MEMORY_PIECE, looked, looked_patient
 from orchestrator.control.log_hub import LogHub, Waker
 from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.store_calls import StoreCalls, StoreSilent
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from orchestrator.services.errors import ClientError
 from shared_store.volume.log_view import LogView
 from shared_store.volume.logs import LogLine, timestamp
 

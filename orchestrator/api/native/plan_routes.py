@@ -15,6 +15,7 @@ from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.control.compute_environments import options_of
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.snapshot import new_nodes
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.api import EngineError, Gang, Plan
@@ -22,7 +23,6 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import JobsOf, Operation

@@ -35,6 +35,7 @@ from orchestrator.control.compute_environments import own_queues, queue_engines
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import facts_of
 from orchestrator.control.store_calls import StoreSilent
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named, short_id
@@ -46,7 +47,6 @@ from orchestrator.services import runs
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import named_definition, queue_names
 from orchestrator.services.damaged_rows import reading
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.contract.phases import Phase, phase_in
 from shared_store.volume.files import DamagedFile

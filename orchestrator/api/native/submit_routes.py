@@ -8,8 +8,7 @@ from fastapi import APIRouter, Header, Request
 from pydantic import BaseModel, Field
 
 from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
-from orchestrator.domain.errors import SpecError
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services.permissions import Operation
 from orchestrator.services.spec_submission import submit_spec
 from orchestrator.services.submission import answer

@@ -9,8 +9,8 @@ from fastapi.responses import PlainTextResponse, Response
 
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.texts import Reference, TextError, digest_of, read
 

@@ -14,8 +14,7 @@ from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.turns import Turns
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.errors import ServerError, UsageError
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError, ServerError, UsageError
 from orchestrator.services.permissions import Operation, Shared
 from orchestrator.spec.tracks import ask
 

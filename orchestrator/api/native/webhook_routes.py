@@ -8,8 +8,8 @@ from fastapi import APIRouter, Request
 
 from orchestrator.api.http.requests import actor_of, reconciler_of
 from orchestrator.control.deliveries import Deliveries
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import CONFLICT
-from orchestrator.services.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import nearest
 

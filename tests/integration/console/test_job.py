@@ -11,8 +11,7 @@ import pytest
 
 from orchestrator.console import job_view
 from orchestrator.console.job_view import State, Views
-from orchestrator.domain.errors import ApiError
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ApiError, ClientError
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.logs import format_line
 from shared_store.volume.metrics import MetricsWriter

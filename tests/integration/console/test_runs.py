@@ -15,7 +15,7 @@ import pyarrow.parquet
 import pytest
 
 from orchestrator.api.turns import Turns
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from shared_store.volume.files import DamagedFile, open_inside, write_json
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import MetricsWriter

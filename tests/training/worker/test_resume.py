@@ -12,7 +12,8 @@ import torch
 
 from tests.conftest import PATIENCE
 from tests.support.worker.tasks import play, same
-from worker.tasks import BUILT_IN, find_task
+from worker.tasks import find_task
+from worker.tasks.run.find import BUILT_IN
 from worker.tasks.run.task import Task
 
 torch.set_num_threads(1)

@@ -15,7 +15,7 @@ from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 from tests.support.worker.rsl_loop import Seen
 from worker.learning.rsl.environment import TaskVecEnv
 from worker.settings.cartpole import CartpoleConfig
-from worker.tasks import BUILT_IN
+from worker.tasks.run.find import BUILT_IN
 from worker.tasks.run.gym import TaskVectorEnv
 
 WORLDS = 8

@@ -15,10 +15,11 @@ from worker.learning.job import configure
 from worker.learning.setup import describe
 from worker.learning.training import Training
 from worker.settings.errors import UserError
-from worker.tasks import BUILT_IN, find_task
+from worker.tasks import find_task
 from worker.tasks.declare.interface import Interface
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.find import BUILT_IN
 from worker.tasks.run.task import Task
 
 WORLDS = 4

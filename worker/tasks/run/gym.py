@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from worker.simulation.episodes import ACTION_LIMIT
-from worker.tasks import BUILT_IN, find_task
+from worker.tasks.run.find import BUILT_IN, find_task
 from worker.tasks.run.task import Task
 
 Observations = np.ndarray | dict[str, np.ndarray]

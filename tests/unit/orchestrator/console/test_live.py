@@ -16,7 +16,7 @@ from fastapi import Request
 from orchestrator.api.http.access import Access
 from orchestrator.console import job, live
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import MetricsWriter, sampled
 

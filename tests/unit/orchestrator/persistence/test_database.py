@@ -14,6 +14,7 @@ from sqlalchemy import event, func, or_, select
 from sqlalchemy.exc import IntegrityError, OperationalError
 from sqlalchemy.orm import Session
 
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.resources import Resources
 from orchestrator.persistence.gangs import Gangs
 from orchestrator.persistence.group_commit import GroupCommit
@@ -21,7 +22,6 @@ from orchestrator.persistence.models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of, record_owner
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
-from orchestrator.services.errors import ClientError
 from shared_store.volume.layout import Run, Store
 from tests.support.orchestrator.rows import job
 

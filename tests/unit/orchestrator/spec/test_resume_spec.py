@@ -12,7 +12,7 @@ import pytest
 import yaml
 from pydantic import BaseModel
 
-from orchestrator.services.errors import ClientError
+from orchestrator.domain.errors import ClientError
 from orchestrator.services.resume import _check_changes, _check_rate
 from orchestrator.services.spec_submission import Changes
 from orchestrator.spec.changes import override
