@@ -28,12 +28,12 @@ from benchmarks.load import Watch, add_option, machine, told
 from orchestrator.console import jobs as jobs_page
 from orchestrator.console import live
 from orchestrator.console.live import Recent
-from orchestrator.domain.arns import definition_arn
 from orchestrator.domain.job import Status
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Attempt, Job, JobDefinition, JobQueue, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
+from orchestrator.services.arns import definition_arn
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.file import load
 from tests.support.console.fixtures import secret_of

@@ -32,7 +32,6 @@ from orchestrator.control.presence import LOST_AFTER, Presence
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_identity import recognise
 from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
-from orchestrator.domain import arns
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.engines.api import EngineError, Setting
 from orchestrator.engines.installed import make_engine
@@ -43,6 +42,7 @@ from orchestrator.home import HomeLock, console_secret
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
+from orchestrator.services import arns
 from orchestrator.services.automatic_evaluations import AutomaticEvaluations
 from shared_store.volume.layout import Store
 

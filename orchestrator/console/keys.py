@@ -13,7 +13,7 @@ from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.domain.arns import here
+from orchestrator.services.arns import here
 from orchestrator.services.context import queue_names
 
 router = page_router()

@@ -15,12 +15,12 @@ from sqlalchemy.orm import Session
 from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain import reasons
-from orchestrator.domain.arns import plain_name
 from orchestrator.domain.errors import ClientError, RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
+from orchestrator.services.arns import plain_name
 from orchestrator.services.damaged_rows import DamagedRow
 from orchestrator.services.permissions import Actor, JobsOf, Operation
 from shared_store.contract.error_text import nearest

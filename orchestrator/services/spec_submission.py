@@ -11,13 +11,13 @@ from typing import Any, Literal
 from sqlalchemy.orm import Session
 
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.arns import definition_arn
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec, gang_needs
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.models import Job, JobQueue
 from orchestrator.services import definitions, submission
+from orchestrator.services.arns import definition_arn
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.fit import fit_of, named_queue

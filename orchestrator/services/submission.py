@@ -14,7 +14,6 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import queue_engines
 from orchestrator.domain import reasons
-from orchestrator.domain.arns import definition_arn, job_arn
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
@@ -26,6 +25,7 @@ from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQ
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import note_changed
 from orchestrator.services import permissions
+from orchestrator.services.arns import definition_arn, job_arn
 from orchestrator.services.context import Context, archived
 from orchestrator.services.permissions import JobsOf, Operation
 from orchestrator.services.sources import check_sources, hold_teacher, uses_of

@@ -9,10 +9,10 @@ from sqlalchemy import select
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.describe import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
-from orchestrator.domain.arns import definition_arn, plain_name
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.models import JobDefinition
 from orchestrator.services import permissions
+from orchestrator.services.arns import definition_arn, plain_name
 from orchestrator.services.context import Context
 from orchestrator.services.definitions import check_owner, register
 from orchestrator.services.permissions import Actor, Operation

@@ -10,10 +10,10 @@ from sqlalchemy.orm import selectinload
 
 from orchestrator.api.batch.describe import array_properties, describe_damaged, describe_job, node_status, summarize
 from orchestrator.api.batch.paging import decode, encode, page, page_size
-from orchestrator.domain.arns import definition_arn, queue_arn, split_reference
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
+from orchestrator.services.arns import definition_arn, queue_arn, split_reference
 from orchestrator.services.context import Context
 from orchestrator.services.damaged_rows import DamagedRow, reading
 from orchestrator.services.permissions import JobsOf, Operation

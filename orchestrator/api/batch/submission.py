@@ -8,9 +8,9 @@ from typing import Any
 from orchestrator.api.batch import fargate, rules
 from orchestrator.api.batch.members import check_consumables
 from orchestrator.control.compute_environments import environments_of
-from orchestrator.domain.arns import split_reference
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.models import Job
+from orchestrator.services.arns import split_reference
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation
 from orchestrator.services.submission import Submission, Wait, answer, answered, open_queue, submit

@@ -15,13 +15,13 @@ from orchestrator.api.logs.errors import LogsError, absent, invalid, present
 from orchestrator.api.logs.events import stored_bytes
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.arns import log_group_arn
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups
 from orchestrator.persistence.models import Job, Node
 from orchestrator.persistence.own_models import LogGroup, LogStream
 from orchestrator.services import permissions
+from orchestrator.services.arns import log_group_arn
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume.layout import Store
 

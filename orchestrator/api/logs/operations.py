@@ -31,9 +31,9 @@ from orchestrator.api.logs.events import Event, event_id, first_and_last
 from orchestrator.api.logs.live_tail import LiveTail, messages
 from orchestrator.api.logs.streams import Stream, created_streams, find_stream, newest_streams
 from orchestrator.control.reconciler import Reconciler
-from orchestrator.domain.arns import here, log_group_arn
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.persistence.models import now
+from orchestrator.services.arns import here, log_group_arn
 from orchestrator.services.permissions import Actor, Operation, Refusal
 
 SETTLE = 500
