@@ -25,11 +25,11 @@ from orchestrator.console import add_console
 from orchestrator.control.account import recognise as recognise_account
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments, in_order
+from orchestrator.control.controller import Controller
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
 from orchestrator.control.presence import LOST_AFTER, Presence
-from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_identity import recognise
 from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
 from orchestrator.domain.errors import ServerError, UsageError
@@ -144,7 +144,7 @@ class Server:
             self.peers = Peers(self.store, home, identity.check)
             stack.callback(self.peers.close)
             try:
-                self.reconciler = Reconciler(
+                self.controller = Controller.assemble(
                     found,
                     nodes,
                     self.store,
@@ -156,18 +156,18 @@ class Server:
                 )
             except DatabaseError as error:
                 raise ServerError(str(error)) from None
-            stack.callback(self.reconciler.close)
-            self.evaluations = AutomaticEvaluations(self.reconciler, self.access.actor_named)
+            stack.callback(self.controller.close)
+            self.evaluations = AutomaticEvaluations(self.controller, self.access.actor_named)
             stack.callback(self.evaluations.close)
             _name_lost_gangs(home, found)
             bound = self._socket.getsockname()[1]
             self.url = (
                 f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
             )
-            self.deliveries = Deliveries(self.reconciler, told, self.url)
+            self.deliveries = Deliveries(self.controller, told, self.url)
             stack.callback(self.deliveries.close)
             self._opened = stack.pop_all()
-        self.app = create_app(self.reconciler, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
+        self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
         add_console(self.app)
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(
@@ -193,8 +193,8 @@ class Server:
         """Start the controller and the server, and tell commands on this machine where it is."""
         self.bus.open()
         self.peers.start()
-        self.reconciler.start()
-        self.reconciler.retention.start(self.reconciler.calls.later)
+        self.controller.start()
+        self.controller.retention.start(self.controller.access.calls.later)
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
@@ -204,7 +204,7 @@ class Server:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
         self._lock.withdraw()
         self.app.state.closing.set()
-        self.reconciler.logs.close()
+        self.controller.logs.close()
         self._uvicorn.should_exit = True
         if self._thread.is_alive():
             self._thread.join(timeout=5)

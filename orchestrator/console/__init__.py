@@ -12,7 +12,7 @@ How to add a page
 
        @router.get("/things")
        def things(request: Request, search: str = "") -> Response:
-           found = page_of_things(reconciler_of(request), search)        # a use case of the API; it raises ClientError
+           found = page_of_things(controller_of(request), search)        # a use case of the API; it raises ClientError
            return render(request, "things.html", things=found)
 
    ``page_router`` (:mod:`orchestrator.console.routing`) turns a ClientError into a page (or JSON for a script), and refuses changes without the form's token

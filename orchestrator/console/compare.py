@@ -10,7 +10,7 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import run_routes
 from orchestrator.console.curves import number
 from orchestrator.console.live import Recent
@@ -95,7 +95,7 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
     """The names that the patterns match, in the order of the patterns, which may be separated by spaces. Raises ClientError."""
     chosen: dict[str, None] = {}
     known: list[str] | None = None
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     given = [part for each in patterns for part in each.split()]
     if len(given) > MOST:
         raise ClientError(
@@ -106,7 +106,7 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
             chosen[pattern] = None
             continue
         if known is None:
-            known = [run.name for run in visible_runs(reconciler, actor)]
+            known = [run.name for run in visible_runs(controller, actor)]
         fitting = [name for name in known if fnmatchcase(name, pattern)]
         if not fitting:
             raise ClientError(f"no run is called like {pattern[:128]}; the page of runs has their names", 404)
@@ -119,13 +119,13 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
 def _groups(request: Request, names: Sequence[str]) -> list[Group]:
     """The runs in groups; pages of the same runs share the result. Raises ClientError for a run that does not exist, or that the caller may not see."""
     actor = actor_of(request)
-    key = (id(reconciler_of(request)), actor, tuple(names))
+    key = (id(controller_of(request)), actor, tuple(names))
     return _recent.get(key, lambda: grouped(map(partial(_facts, request), names)))
 
 
 def _facts(request: Request, name: str) -> RunFacts:
     described = run_routes.run_detail(request, name)
-    run = permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_METRICS)
+    run = permitted_run(controller_of(request), actor_of(request), name, Operation.READ_METRICS)
     try:
         records = sampled(run, _RECORDS)
     except OSError as error:

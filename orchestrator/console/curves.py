@@ -25,7 +25,7 @@ from typing import Any
 
 from fastapi import Query, Request
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.console.live import Recent
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
@@ -54,7 +54,7 @@ def run_curves(
     points: int = Query(default=POINTS, ge=2, le=_MOST_POINTS),
 ) -> dict[str, Any]:
     """A window of a run's metrics."""
-    run = permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_METRICS)
+    run = permitted_run(controller_of(request), actor_of(request), name, Operation.READ_METRICS)
     key = (str(run.path), tuple(names), begin, end, points)
     try:
         return _recent.get(key, partial(curves_of, run, names, begin, end, points))

@@ -12,7 +12,7 @@ from fastapi import Request, Response
 from fastapi.responses import RedirectResponse
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.routes import job_detail
 from orchestrator.console.curves import columns
 from orchestrator.console.job_config import before_it, code_of, differences
@@ -24,7 +24,7 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.run_files import File, files_of
 from orchestrator.console.submit_fields import written
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import short_id
@@ -46,18 +46,18 @@ _RECORDS = 200
 @router.get("/jobs/{reference}")
 def job(request: Request, reference: str) -> Response:
     """The page; a name or the start of an id is redirected to it. Without the store it has what the database knows."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     detail = job_detail(request, reference)
     if detail["id"] != reference:
         return RedirectResponse(f"/jobs/{detail['id']}", 303)
-    described = batch.call(reconciler, actor, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
+    described = batch.call(controller, actor, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
     array = described.get("arrayProperties", {})
     spec = detail["spec"] or {}
     is_visible = detail["results"] is not None
     before, files, checkpoints = None, list[File](), dict[str, Any]()
     if detail["storeProblem"] is None:
         try:
-            spec, before, files, checkpoints = reconciler.calls.call(partial(_read, reconciler, actor, detail))
+            spec, before, files, checkpoints = controller.access.calls.call(partial(_read, controller, actor, detail))
         except StoreSilent as error:
             detail["storeProblem"] = str(error)
     view = views.state(detail["id"])
@@ -95,21 +95,21 @@ def job(request: Request, reference: str) -> Response:
 @_stored.get("/jobs/{reference}/stream")
 def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     """The changes of the page and the new lines of its log, as events. The id of an event is the page's position in both."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    key = (id(reconciler), actor, chosen.job)
+    controller, actor = controller_of(request), actor_of(request)
+    key = (id(controller), actor, chosen.job)
     look = partial(_recent.get, key, partial(_look, request, chosen.job))
     iteration, places = _had(last_id(request))
-    log = LiveLog(reconciler.logs, chosen, chosen.end() if places is None else places)
+    log = LiveLog(controller.logs, chosen, chosen.end() if places is None else places)
     return stream(request, _Feed(look, log, chosen.run, iteration).changes, stored=True, during=log)
 
 
 def _read(
-    reconciler: Reconciler, actor: Actor, detail: Mapping[str, Any]
+    controller: Controller, actor: Actor, detail: Mapping[str, Any]
 ) -> tuple[Mapping[str, Any], tuple[str, str, Mapping[str, Any]] | None, list[File], dict[str, Any]]:
     """What the page has from the store: the spec with its texts, the other side of the comparison, the run's files, and its checkpoints."""
-    spec = with_texts(reconciler, detail["run"], detail["spec"] or {})
-    files = _files(reconciler, actor, detail["run"]) if detail["results"] is not None else []
-    return spec, before_it(reconciler, actor, detail), files, _checkpoints(reconciler, actor, detail)
+    spec = with_texts(controller, detail["run"], detail["spec"] or {})
+    files = _files(controller, actor, detail["run"]) if detail["results"] is not None else []
+    return spec, before_it(controller, actor, detail), files, _checkpoints(controller, actor, detail)
 
 
 def _look(request: Request, job_id: str) -> dict[str, Any]:
@@ -117,12 +117,12 @@ def _look(request: Request, job_id: str) -> dict[str, Any]:
     actor = actor_of(request)
     detail = job_detail(request, job_id)
     facts = {**facts_of(detail), "view": views.state(job_id, is_seen=True).text}
-    checkpoints = _checkpoints(reconciler_of(request), actor, detail)
+    checkpoints = _checkpoints(controller_of(request), actor, detail)
     return {"facts": facts, "attempts": attempts_of(detail), "checkpoints": checkpoints}
 
 
-def _checkpoints(reconciler: Reconciler, actor: Actor, detail: Mapping[str, Any]) -> dict[str, Any]:
-    return checkpoints_of(reconciler, actor, detail["run"]) if detail["results"] is not None else {}
+def _checkpoints(controller: Controller, actor: Actor, detail: Mapping[str, Any]) -> dict[str, Any]:
+    return checkpoints_of(controller, actor, detail["run"]) if detail["results"] is not None else {}
 
 
 @dataclass
@@ -185,9 +185,9 @@ def _had(given: str) -> tuple[int | None, dict[str, int] | None]:
     return None, None
 
 
-def _files(reconciler: Reconciler, actor: Actor, name: str) -> list[File]:
+def _files(controller: Controller, actor: Actor, name: str) -> list[File]:
     try:
-        return files_of(permitted_run(reconciler, actor, name, Operation.READ_RUN))
+        return files_of(permitted_run(controller, actor, name, Operation.READ_RUN))
     except (ClientError, DamagedFile, OSError):
         return []
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 from fastapi import Depends, Request, Response
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import routes
 from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.forms import Form, Question, done, sent_form
@@ -37,7 +37,7 @@ def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> R
     job, name, _, _ = _job(request, reference, Operation.TERMINATE_JOB)
     text = "A training saves a checkpoint before it leaves, and can be resumed. A waiting job is cancelled."
     form.confirm(Question(f"Stop {name}?", text, "Stop"))
-    refused = stop_jobs(reconciler_of(request), actor, [job], f"stopped in the console by {actor.name}")
+    refused = stop_jobs(controller_of(request), actor, [job], f"stopped in the console by {actor.name}")
     if job in refused:
         raise refused[job]
     return done(request, f"/jobs/{job}", f"{name} is asked to stop")
@@ -69,7 +69,7 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
         form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and wanted is not None else None
     changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepted(form) else []))
-    answer = resume_job(reconciler_of(request), actor, run, Changes(iteration, changes, directory))
+    answer = resume_job(controller_of(request), actor, run, Changes(iteration, changes, directory))
     return done(request, f"/jobs/{answer['jobId']}", f"resumed {run.name} from iteration {answer['iteration']}")
 
 
@@ -79,7 +79,7 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
     actor = actor_of(request)
     run, directory = _run(request, reference, Operation.CLONE_RUN)
     name = _named(form, "the new run")
-    told = clones.clone(reconciler_of(request), actor, run, name, Changes(_checkpoint(form), _changes(form), directory))
+    told = clones.clone(controller_of(request), actor, run, name, Changes(_checkpoint(form), _changes(form), directory))
     parent = told["parent"]
     return done(request, f"/jobs/{told['jobId']}", f"cloned {parent['run']}@{parent['iteration']} as run {told['run']}")
 
@@ -106,8 +106,8 @@ def record(request: Request, reference: str, form: Form = Depends(sent_form)) ->
 def register(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Keep an exported checkpoint as the next version of a model."""
     run, _ = _run(request, reference, Operation.REGISTER_MODEL)
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    model = models.register(reconciler, actor, run.name, _named(form, "the model"), _checkpoint(form))
+    controller, actor = controller_of(request), actor_of(request)
+    model = models.register(controller, actor, run.name, _named(form, "the model"), _checkpoint(form))
     told = f"registered {run.name}@{model.facts()['iteration']} as {model.name}@{model.version}"
     return done(request, f"/jobs/{reference}", told)
 
@@ -116,14 +116,14 @@ def _derived(request: Request, submit: Callable[..., Job], reference: str, form:
     """Submit a job that reads a checkpoint, and go to its page. Raises ClientError."""
     run, directory = _run(request, reference, Operation.READ_RUN)
     section = {"checkpoint": _iteration(run, form), **_accepted(form)}
-    job = submit(reconciler_of(request), actor_of(request), run, section, directory)
+    job = submit(controller_of(request), actor_of(request), run, section, directory)
     return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
 
 
 def _job(request: Request, reference: str, operation: Operation) -> tuple[str, str, str, str]:
     """Id, title, run and working directory of a job with which the caller may do this. Raises ClientError."""
     actor = actor_of(request)
-    with reconciler_of(request).database.session() as session:
+    with controller_of(request).database.session() as session:
         job = permitted_job(session, actor, reference, operation)
         return job.id, f"{job.name} ({short_id(job.id)})", job.run, job.gang.options.directory
 
@@ -131,7 +131,7 @@ def _job(request: Request, reference: str, operation: Operation) -> tuple[str, s
 def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, str]:
     """The run of a job, with which the caller may do this, and the job's working directory. Raises ClientError."""
     _, _, run, directory = _job(request, reference, Operation.READ_JOB)
-    return permitted_run(reconciler_of(request), actor_of(request), run, operation), directory
+    return permitted_run(controller_of(request), actor_of(request), run, operation), directory
 
 
 def _checkpoint(form: Form) -> _Wanted:

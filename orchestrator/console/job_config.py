@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from sqlalchemy import select
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.models import Job
@@ -76,14 +76,14 @@ def _shown(value: Any) -> str:
 
 
 def before_it(
-    reconciler: Reconciler, actor: Actor, detail: Mapping[str, Any]
+    controller: Controller, actor: Actor, detail: Mapping[str, Any]
 ) -> tuple[str, str, Mapping[str, Any]] | None:
     """The other side of the configuration's comparison: a title, an address and a spec; None where there is none.
 
     That is the job before it in its run, else the run whose weights a clone began with.
     """
     queues = actor.queues
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         query = select(Job).where(
             Job.run == detail["run"], Job.created_at < detail["createdAt"], Job.id != detail["id"]
         )
@@ -94,18 +94,18 @@ def before_it(
             with reading(earlier):
                 spec = earlier.gang.spec
             if spec:
-                spec = with_texts(reconciler, detail["run"], spec)
+                spec = with_texts(controller, detail["run"], spec)
                 return f"the job before it, {earlier.name}", f"/jobs/{earlier.id}", actor.shown(spec)
     parent = (detail["results"] or {}).get("parent") or {}
     name = parent.get("run")
     if not isinstance(name, str):
         return None
     try:
-        run = facts_of(permitted_run(reconciler, actor, name, Operation.READ_RUN))
-        with reconciler.database.session() as session:
+        run = facts_of(permitted_run(controller, actor, name, Operation.READ_RUN))
+        with controller.database.session() as session:
             spec = runs.spec_of(session, actor, run)
     except (ClientError, DamagedFile, OSError):
         return None  # deleted, or another's
     if not spec:
         return None
-    return f"its parent {name}", f"/runs/{name}", actor.shown(with_texts(reconciler, name, spec))
+    return f"its parent {name}", f"/runs/{name}", actor.shown(with_texts(controller, name, spec))

@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Any
 
 from orchestrator.console import words
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import born_at
@@ -167,10 +167,10 @@ def _automatic(told: Mapping[str, Any] | None) -> str:
     return "; ".join([*parts, *([told["problem"]] if told["problem"] else [])])
 
 
-def checkpoints_of(reconciler: Reconciler, actor: Actor, run: str) -> dict[str, dict[str, Any]]:
+def checkpoints_of(controller: Controller, actor: Actor, run: str) -> dict[str, dict[str, Any]]:
     """The rows of a run's newest checkpoints and its best one, by name, the newest first; none where they can't be seen."""
     try:
-        found = permitted_run(reconciler, actor, run, Operation.READ_CHECKPOINTS)
+        found = permitted_run(controller, actor, run, Operation.READ_CHECKPOINTS)
         return _checkpoints(found)
     except (ClientError, OSError):
         return {}

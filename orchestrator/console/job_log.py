@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Query, Request
 
 from orchestrator.api.http.following import PIECE
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.log_stream import positions_of
 from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.live import Event
@@ -39,10 +39,10 @@ def chosen_log(
     attempt: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
 ) -> Chosen:
     """The lines of the job that are asked for; empty numbers mean all. Raises ClientError."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    with reconciler.database.session() as session:
+    controller, actor = controller_of(request), actor_of(request)
+    with controller.database.session() as session:
         job = permitted_job(session, actor, reference, Operation.READ_JOB_LOGS)
-        run, job_id = reconciler.store.run(job.run), job.id
+        run, job_id = controller.access.store.run(job.run), job.id
     numbers = (int(each) if each else None for each in (node, rank, attempt))
     return Chosen(run, job_id, *numbers)
 

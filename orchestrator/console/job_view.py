@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 from fastapi import Request, Response
 
 from orchestrator.api.http.auth import is_loopback
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.routes import job_detail
 from orchestrator.console.forms import done
 from orchestrator.console.routing import page_router
@@ -146,7 +146,7 @@ def show(request: Request, reference: str) -> Response:
         raise ClientError(f"job {detail['name']} is no training that runs; its checkpoints can be recorded", CONFLICT)
     if find_spec("newton") is None:
         raise ClientError("the live view needs the simulation on this machine: pip install 'muster[worker]'", CONFLICT)
-    run = permitted_run(reconciler_of(request), actor_of(request), detail["run"], Operation.READ_RUN)
+    run = permitted_run(controller_of(request), actor_of(request), detail["run"], Operation.READ_RUN)
     command = [sys.executable, "-P", "-m", "worker.telemetry.view", "--training", str(run.path), "--job", detail["id"]]
     views.start(detail["id"], [*command, "--port", "0", "--framed-by", _origin(request)])
     return done(request, f"/jobs/{detail['id']}", "the live view starts")

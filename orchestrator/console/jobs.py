@@ -10,14 +10,14 @@ from urllib.parse import urlencode
 
 from fastapi import Depends, Query, Request, Response
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
 from orchestrator.console import words
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.domain.reasons import short_id
@@ -72,9 +72,9 @@ def _choice(
 def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The table."""
     actor = actor_of(request)
-    reconciler, chosen = reconciler_of(request), choice.filter
-    rows, totals = _window(reconciler, actor, choice)
-    with reconciler.database.session() as session:
+    controller, chosen = controller_of(request), choice.filter
+    rows, totals = _window(controller, actor, choice)
+    with controller.database.session() as session:
         queues = queue_names(session, actor)
     return render(
         request,
@@ -94,7 +94,7 @@ def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
 def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The changes in a window of the table, as events."""
     actor = actor_of(request)
-    table, look = Rows(), partial(_window, reconciler_of(request), actor, choice)
+    table, look = Rows(), partial(_window, controller_of(request), actor, choice)
 
     def changes() -> Sequence[Event]:
         return table.changes(*look())
@@ -105,10 +105,10 @@ def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Respons
 @router.post("/jobs/stop")
 def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Stop the jobs that were chosen, or all that the filter finds."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     if form.one("all") == "yes":
         wanted = _wanted(form.one("state"), form.one("queue"), form.one("search"))
-        with reconciler.database.session() as session:
+        with controller.database.session() as session:
             ids = ids_of(session, actor, wanted)
     else:
         ids = form.every("job")
@@ -120,7 +120,7 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     refused: list[ClientError] = []
     for start in range(0, len(ids), _AT_ONCE):
         part = ids[start : start + _AT_ONCE]
-        refused += stop_jobs(reconciler, actor, part, f"stopped in the console by {actor.name}").values()
+        refused += stop_jobs(controller, actor, part, f"stopped in the console by {actor.name}").values()
     if refused:
         raise ClientError(f"{len(refused)} of {several} can't be stopped: {refused[0]}", 403)
     return done(
@@ -136,17 +136,17 @@ def _wanted(state: str, queue: str, search: str) -> Wanted:
     return Wanted(GROUPS[state], queue, search)
 
 
-def _window(reconciler: Reconciler, actor: Actor, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
+def _window(controller: Controller, actor: Actor, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
     """Rows of a page of the table, by id, and the totals; open pages of all who see the same queues share them."""
     seen = actor.queues
-    key = (id(reconciler), None if seen is None else tuple(sorted(seen)), choice.wanted, choice.after, choice.before)
-    return _recent.get(key, partial(_read_window, reconciler, actor, choice))
+    key = (id(controller), None if seen is None else tuple(sorted(seen)), choice.wanted, choice.after, choice.before)
+    return _recent.get(key, partial(_read_window, controller, actor, choice))
 
 
 def _read_window(
-    reconciler: Reconciler, actor: Actor, choice: _Choice
+    controller: Controller, actor: Actor, choice: _Choice
 ) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:
-    found = page_of_jobs(reconciler, actor, choice.wanted, ROWS, choice.after, choice.before)
+    found = page_of_jobs(controller, actor, choice.wanted, ROWS, choice.after, choice.before)
     rows = {job["id"]: _row(job) for job in found["jobs"]}
     counts, more = found["counts"], "+" if found["areMore"] else ""
     totals = {

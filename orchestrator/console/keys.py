@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from fastapi import Depends, Request, Response
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.key_routes import create_key, delete_key, is_writable, list_keys
 from orchestrator.console import words
 from orchestrator.console.forms import Form, Question, done, sent_form
@@ -26,7 +26,7 @@ def keys(request: Request) -> Response:
     """The list."""
     actor = actor_of(request)
     rows = _rows(request)
-    with reconciler_of(request).database.session() as session:
+    with controller_of(request).database.session() as session:
         queues = queue_names(session, actor)
     blank = dict.fromkeys(("name", "id", "rights", "created", "own"), "")
     return render(

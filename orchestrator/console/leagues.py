@@ -10,7 +10,7 @@ from typing import Any
 from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.batch import operations as batch
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import league_routes as api
 from orchestrator.api.native.job_list import Wanted, page_of_jobs
 from orchestrator.api.native.league_routes import LEAGUE_TAG, MODEL_TAG
@@ -208,12 +208,12 @@ def _rules(league: Mapping[str, Any]) -> dict[str, Any]:
 
 def _races(request: Request, name: str) -> dict[str, dict[str, Any]]:
     """The newest races of a league that the caller may see, by job, without those that are entered."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
-    jobs = page_of_jobs(reconciler, actor, Wanted(search=begins), _READ)["jobs"]
+    jobs = page_of_jobs(controller, actor, Wanted(search=begins), _READ)["jobs"]
     if not jobs:
         return {}
-    described = batch.call(reconciler, actor, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
+    described = batch.call(controller, actor, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
     tags = {each["jobId"]: each.get("tags") or {} for each in described}
     entered = api.entered_jobs(request, name)
     ours = [job for job in jobs if tags.get(job["id"], {}).get(LEAGUE_TAG) == name and job["id"] not in entered]

@@ -18,7 +18,7 @@ from fastapi.sse import format_sse_event
 
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.following import Following, looked_patiently
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.console.pages import session
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.errors import ClientError, Unavailable
@@ -81,7 +81,7 @@ def stream(
         return access.still_admits(identity, given)
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
-    calls = reconciler_of(request).followed if stored else None
+    calls = controller_of(request).access.followed if stored else None
     events = _within(during or nullcontext(), _events(look, calls, interval, admitted, request.app.state.closing))
     return _Live(events, media_type="text/event-stream", headers=headers)
 

@@ -10,13 +10,13 @@ from urllib.parse import urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.queue_overview import FIRST, overview
 from orchestrator.console import words
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import short_id, title
 from orchestrator.services.permissions import Actor
@@ -33,7 +33,7 @@ _recent = Recent()
 def queues(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
     """All tables, or those of one queue with more of its jobs."""
     actor = actor_of(request)
-    tables = _tables(reconciler_of(request), actor, queue)
+    tables = _tables(controller_of(request), actor, queue)
     return render(
         request,
         "queues.html",
@@ -49,7 +49,7 @@ def queues(request: Request, queue: str = Query(default="", max_length=128)) -> 
 def queues_stream(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
     """The changes in the tables, as events."""
     actor = actor_of(request)
-    look = partial(_tables, reconciler_of(request), actor, queue)
+    look = partial(_tables, controller_of(request), actor, queue)
     known = {name: Rows(name) for name in _ROWS}
 
     def changes() -> Sequence[Event]:
@@ -58,14 +58,14 @@ def queues_stream(request: Request, queue: str = Query(default="", max_length=12
     return stream(request, changes)
 
 
-def _tables(reconciler: Reconciler, actor: Actor, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
+def _tables(controller: Controller, actor: Actor, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
     """The rows of every table, by key; open pages of the same queue share them."""
-    key = (id(reconciler), actor, queue)
-    return _recent.get(key, partial(_read_tables, reconciler, actor, queue))
+    key = (id(controller), actor, queue)
+    return _recent.get(key, partial(_read_tables, controller, actor, queue))
 
 
-def _read_tables(reconciler: Reconciler, actor: Actor, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
-    found = overview(reconciler, actor, queue)
+def _read_tables(controller: Controller, actor: Actor, queue: str) -> dict[str, dict[str, dict[str, Any]]]:
+    found = overview(controller, actor, queue)
     waiting = [
         {**job, "queue": each["name"], "place": place}
         for each in found["queues"]

@@ -14,7 +14,7 @@ from urllib.parse import quote
 from fastapi import Request, Response
 from fastapi.responses import StreamingResponse
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run
@@ -86,8 +86,8 @@ def _walk(directory: Path, depth: int) -> Iterator[Path]:
 @router.get("/runs/{name}/files/{path:path}")
 def file(request: Request, name: str, path: str) -> Response:
     """A file of a run: pictures are shown, other files are downloaded."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    run = permitted_run(reconciler, actor, name, Operation.READ_RUN)
+    controller, actor = controller_of(request), actor_of(request)
+    run = permitted_run(controller, actor, name, Operation.READ_RUN)
     parts = path.split("/")
     if parts[0] not in PLACES or len(parts) > _DEEPEST + 1 or not all(map(NAME.fullmatch, parts)):
         raise ClientError(f"run {run.name} shows no file {path[:100]!r}", 404)
@@ -102,11 +102,11 @@ def file(request: Request, name: str, path: str) -> Response:
     async def blocks() -> AsyncIterator[bytes]:
         left = size  # a file that grows meanwhile has no more than was announced
         try:
-            while left and (block := await reconciler.calls.answer(partial(opened.read, min(left, _BLOCK)))):
+            while left and (block := await controller.access.calls.answer(partial(opened.read, min(left, _BLOCK)))):
                 left -= len(block)
                 yield block
         finally:
-            reconciler.calls.later(opened.close)  # waits for a read that hangs
+            controller.access.calls.later(opened.close)  # waits for a read that hangs
 
     is_picture = path.endswith(_PICTURES)
     headers = {

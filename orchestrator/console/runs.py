@@ -8,14 +8,14 @@ from urllib.parse import quote, urlencode
 
 from fastapi import Query, Request, Response
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import run_routes
 from orchestrator.console import words
 from orchestrator.console.curves import number
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.reasons import short_id
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import last_metrics, list_runs
@@ -47,7 +47,7 @@ def runs(
 ) -> Response:
     """The list, by name, a page at a time."""
     actor = actor_of(request)
-    rows = _window(reconciler_of(request), actor, search, after)
+    rows = _window(controller_of(request), actor, search, after)
     is_full = len(rows) == ROWS
     return render(
         request,
@@ -67,15 +67,15 @@ def runs_stream(
 ) -> Response:
     """The changes in a page of the list, as events."""
     actor = actor_of(request)
-    table, reconciler = Rows(), reconciler_of(request)
-    return stream(request, lambda: table.changes(_window(reconciler, actor, search, after), {}), _INTERVAL, stored=True)
+    table, controller = Rows(), controller_of(request)
+    return stream(request, lambda: table.changes(_window(controller, actor, search, after), {}), _INTERVAL, stored=True)
 
 
 @router.get("/runs/{name}")
 def run(request: Request, name: str) -> Response:
     """One run."""
     described, tables = _read_run(request, name)
-    metrics = last_metrics(reconciler_of(request).store.run(name)) or {}
+    metrics = last_metrics(controller_of(request).access.store.run(name)) or {}
     return render(
         request,
         "run.html",
@@ -97,12 +97,12 @@ def run_stream(request: Request, name: str) -> Response:
     """The changes in the tables of a run, as events; ``changed`` when it has new metrics."""
     _ = run_routes.run_detail(request, name)  # refused at once, if at all
     known = {key: Rows(key) for key in _TABLES}
-    reconciler, before = reconciler_of(request), [-1]
+    controller, before = controller_of(request), [-1]
 
     def changes() -> Sequence[Event]:
         _, tables = _read_run(request, name)
         found = [event for key, rows in tables.items() for event in known[key].changes(rows, {})]
-        metrics = last_metrics(reconciler.store.run(name)) or {}
+        metrics = last_metrics(controller.access.store.run(name)) or {}
         if (iteration := metrics.get("iteration", 0)) != before[0]:
             before[0] = iteration
             found.append(Event("changed", {"iteration": iteration, **_progress(name, metrics)}))
@@ -111,13 +111,13 @@ def run_stream(request: Request, name: str) -> Response:
     return stream(request, changes, stored=True)
 
 
-def _window(reconciler: Reconciler, actor: Actor, search: str, after: str) -> dict[str, dict[str, Any]]:
+def _window(controller: Controller, actor: Actor, search: str, after: str) -> dict[str, dict[str, Any]]:
     """Rows of a page of the list, by the run's name; open pages with the same choice share them."""
 
     def look() -> dict[str, dict[str, Any]]:
-        return {each["run"]: _row(each) for each in list_runs(reconciler, actor, after, ROWS, search)}
+        return {each["run"]: _row(each) for each in list_runs(controller, actor, after, ROWS, search)}
 
-    return _listed.get((id(reconciler), actor, search, after), look)
+    return _listed.get((id(controller), actor, search, after), look)
 
 
 def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, dict[str, dict[str, Any]]]]:
@@ -134,7 +134,7 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], dict[str, di
         }
         return described, {key: {row["key"]: row for row in map(of, given[key])} for key, of in _TABLES.items()}
 
-    return _recent.get((id(reconciler_of(request)), actor, name), look)
+    return _recent.get((id(controller_of(request)), actor, name), look)
 
 
 def _row(run: Mapping[str, Any]) -> dict[str, Any]:

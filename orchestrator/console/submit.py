@@ -11,7 +11,7 @@ from typing import Any
 from fastapi import Depends, Query, Request, Response
 from fastapi.responses import JSONResponse
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import plan_routes, routes
 from orchestrator.api.native.plan_routes import PlanRequest
 from orchestrator.api.turns import Turns
@@ -82,10 +82,10 @@ def plain(request: Request, job: str = Query(default="", max_length=200)) -> Res
     """The YAML editor; with ``job`` the spec of that job, to submit a changed one."""
     text = BEGINNING
     if job:
-        detail, reconciler = routes.job_detail(request, job), reconciler_of(request)
+        detail, controller = routes.job_detail(request, job), controller_of(request)
         if not detail["spec"]:
             raise ClientError(f"job {job} was not submitted with a job YAML")
-        text = written(reconciler.calls.call(partial(with_texts, reconciler, detail["run"], detail["spec"])))
+        text = written(controller.access.calls.call(partial(with_texts, controller, detail["run"], detail["spec"])))
     return _editor(request, text, None)
 
 
@@ -171,7 +171,7 @@ def _submitted(request: Request, form: Form) -> tuple[str, str]:
     if spec is None:
         assert problem is not None
         raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
-    job = submit_spec(reconciler_of(request), actor_of(request), spec, "")
+    job = submit_spec(controller_of(request), actor_of(request), spec, "")
     return job.id, job.name
 
 
@@ -200,7 +200,7 @@ def _checked(request: Request, text: str, whole: bool) -> tuple[Spec | None, Pro
     tries = whole and actor.queues is None
     try:
         with (_turns if tries else _checks).turn():
-            store = str(reconciler_of(request).store.path)
+            store = str(controller_of(request).access.store.path)
             return from_text(text, SOURCE, whole=tries, store=lambda: store), None
     except SpecError as error:
         return None, problem_of(str(error), text)
@@ -227,7 +227,7 @@ def _groups(request: Request, task: str) -> list[Group]:
     actor.check(Operation.SUBMIT_JOB)
     if task not in tasks():
         raise ClientError(f"no task is called {task[:100]!r}; {nearest(task, list(tasks()))}", 404)
-    with reconciler_of(request).database.session() as session:
+    with controller_of(request).database.session() as session:
         return groups(task, queue_names(session, actor))
 
 

@@ -9,7 +9,7 @@ from urllib.parse import quote
 
 from fastapi import Depends, Query, Request, Response
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.track_routes import MakeRequest, list_tracks, make_track, picture
 from orchestrator.console.forms import Form, body_of, done, sent_form
 from orchestrator.console.live import Recent
@@ -72,17 +72,17 @@ def outline(request: Request, name: str) -> Response:
 @router.get("/tracks/{name}/picture.png")
 def large(request: Request, name: str) -> Response:
     """The picture that ``muster tracks show`` draws."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     actor.check(Operation.LIST_TRACKS)
-    key = ("picture", str(reconciler.store.path), name)
-    return _picture(_recent.get(key, partial(picture, reconciler, name)), "image/png")
+    key = ("picture", str(controller.access.store.path), name)
+    return _picture(_recent.get(key, partial(picture, controller, name)), "image/png")
 
 
 def known(request: Request) -> Sequence[Mapping[str, Any]]:
     """All tracks with their measures and borders. Raises ClientError."""
     actor = actor_of(request)
     actor.check(Operation.LIST_TRACKS)
-    store = reconciler_of(request).store
+    store = controller_of(request).access.store
     try:
         names = tuple(stored.names(store))
     except stored.TrackError as error:
@@ -107,7 +107,7 @@ def _one(request: Request, name: str) -> Mapping[str, Any]:
         return found[name]
     if not stored.is_made(name):
         raise ClientError(f"track {name[:130]!r} does not exist; {nearest(name, [*found, 'random:7'])}", 404)
-    store = reconciler_of(request).store
+    store = controller_of(request).access.store
     drawn_one: Mapping[str, Any] = _recent.get(
         ("track", str(store.path), name), partial(list_tracks, request, name, True)
     )[0]

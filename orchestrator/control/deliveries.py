@@ -22,7 +22,7 @@ from sqlalchemy import ColumnElement, event, func, select, update
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.models import Job, JobQueue, now
@@ -48,11 +48,11 @@ class Deliveries:
     """The threads, one for each webhook; :meth:`note` is called by the database as jobs end."""
 
     def __init__(
-        self, reconciler: Reconciler, webhooks: Sequence[Webhook], link: str, pauses: Sequence[float] = PAUSES
+        self, controller: Controller, webhooks: Sequence[Webhook], link: str, pauses: Sequence[float] = PAUSES
     ) -> None:
         """``link``: where this controller listens; ``pauses``: seconds after each failed try."""
         self.webhooks = {webhook.name: webhook for webhook in webhooks}
-        self._reconciler, self._database, self._link, self._pauses = reconciler, reconciler.database, link, pauses
+        self._controller, self._database, self._link, self._pauses = controller, controller.database, link, pauses
         self._backoff = Backoff(log)
         self._ending = threading.Event()
         self._wake = {name: threading.Event() for name in self.webhooks}
@@ -65,7 +65,7 @@ class Deliveries:
     def start(self) -> None:
         """Deliver the messages that an earlier controller has left, except to webhooks that are not in the file any more."""
         if self.webhooks:  # a controller without any, such as that of `muster run`, leaves what waits to the next one
-            with suppress(DatabaseError), self._reconciler.writing, self._database.session() as session:
+            with suppress(DatabaseError), self._controller.writes.lock, self._database.session() as session:
                 gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
                 said = "no webhook is called so any more"
                 session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=said))
@@ -133,7 +133,7 @@ class Deliveries:
         while not self._ending.is_set():
             wake.clear()  # before the look: what is committed after it wakes the thread
             try:
-                pause = _IDLE if self._reconciler.trouble is not None else self._deliver_next(webhook)
+                pause = _IDLE if self._controller.reconciler.trouble is not None else self._deliver_next(webhook)
             except DatabaseError:  # said by the controller
                 pause = _IDLE
             except Exception as error:
@@ -156,15 +156,15 @@ class Deliveries:
             body, job = row.body, session.get(Job, row.job)
         if body is None and job is not None:
             body = _json(self._message(webhook, job)).decode()
-            with self._reconciler.writing, self._database.session() as session:
+            with self._controller.writes.session() as session:
                 session.get_one(WebhookDelivery, row.id).body = body  # before it is sent: each try has the same
         problem = "its job is forgotten" if body is None else self._send(webhook, row.id, body.encode())
         self._note_try(webhook, row.id, problem, final=body is None)
         return 0.0
 
     def _note_try(self, webhook: Webhook, identity: str, problem: str | None, *, final: bool) -> None:
-        monitoring = self._reconciler.monitoring
-        with self._reconciler.writing, self._database.session() as session:
+        monitoring = self._controller.monitoring
+        with self._controller.writes.session() as session:
             row = session.get_one(WebhookDelivery, identity)
             if problem is None:
                 session.delete(row)
@@ -212,7 +212,7 @@ class Deliveries:
     def _message(self, webhook: Webhook, job: Job) -> dict[str, Any]:
         attempts, reason = self._ended(job)
         name = run_of(job)
-        checkpoint, summary = _evaluated(self._reconciler.store.run(name), job)
+        checkpoint, summary = _evaluated(self._controller.access.store.run(name), job)
         evaluation = {key: summary[key] for key in _SHOWN} if summary else None
         data = {
             "job": job.id,

@@ -38,6 +38,10 @@ class Isolation:
         self.before: Callable[[Session, Sequence[Job]], None] = lambda session, jobs: None
         """Called with the jobs that are worked on next."""
 
+    def withdrawn(self, job_id: str, reason: str) -> None:
+        """A job can't start now: it is tried again at growing intervals."""
+        self.backoff.failed(("start", job_id), reason, of=f"job {job_id}")
+
     def part(self, what: str, body: Callable[[], None]) -> None:
         """Carry out one part of a pass."""
         try:

@@ -19,7 +19,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain.errors import ClientError, SpecError, Unavailable
 from orchestrator.domain.job import Status
@@ -74,15 +74,15 @@ class AutomaticEvaluations:
     """The thread that sees new checkpoints and submits their evaluations."""
 
     def __init__(
-        self, reconciler: Reconciler, actor_named: Callable[[str], Actor | None], interval: float = LOOK
+        self, controller: Controller, actor_named: Callable[[str], Actor | None], interval: float = LOOK
     ) -> None:
         """
         Args:
-            reconciler: The controller.
+            controller: The controller.
             actor_named: The actor of that name with the rights that it has now; None where its key is gone.
             interval: Seconds between two looks.
         """
-        self._reconciler, self._actor_named, self._interval = reconciler, actor_named, interval
+        self._controller, self._actor_named, self._interval = controller, actor_named, interval
         self._known: dict[str, _Training | None] = {}
         """By job, of those that run; None of one without a section ``evaluation``."""
         self._backoff = Backoff(log)
@@ -105,14 +105,14 @@ class AutomaticEvaluations:
     def _loop(self) -> None:
         self._on_store("unclaimed checkpoints", self._let_go)
         while not self._ending.wait(self._interval):
-            if self._reconciler.trouble is None and self._reconciler.store_problem() is None:
+            if self._controller.reconciler.trouble is None and self._controller.access.problem() is None:
                 self.look()
 
     def look(self) -> None:
         """One look at the evaluations that are open and at all trainings that run; one that can't be handled does not stop the others."""
         self._backoff.tidy()
         self._isolated("open evaluations", self._close_ended)
-        active = self._reconciler.work_queue.active()
+        active = self._controller.work_queue.active()
         self._known = {job: self._known[job] for job in active if job in self._known}
         for job in active:
             self._on_store(f"job {job}", partial(self._look_at, job))
@@ -148,25 +148,25 @@ class AutomaticEvaluations:
 
     def _let_go(self) -> None:
         """Give up the claims of a controller that was killed before it submitted their evaluations."""
-        with self._reconciler.database.session() as session:
+        with self._controller.database.session() as session:
             rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open.is_(False))).all()
             names = [row.run for row in rows]
         for name in names:
-            run = self._reconciler.store.run(name)
+            run = self._controller.access.store.run(name)
             for checkpoint in wanted_checkpoints(run):
                 evaluation_is_over(run, checkpoint)
 
     def _close_ended(self) -> None:
         """Give up the claim on checkpoints whose evaluation has ended, well or not."""
-        with self._reconciler.database.session() as session:
+        with self._controller.database.session() as session:
             rows = session.scalars(select(AutomaticEvaluation).where(AutomaticEvaluation.open)).all()
             ended = [(row.run, row.checkpoint or "") for row in rows if not _is_open(session, row)]
         for name, checkpoint in ended:
             self._on_store(f"run {name}", partial(self._close, name, checkpoint))
 
     def _close(self, name: str, checkpoint: str) -> None:
-        evaluation_is_over(self._reconciler.store.run(name), checkpoint)
-        with self._reconciler.writing, self._reconciler.database.session() as session:
+        evaluation_is_over(self._controller.access.store.run(name), checkpoint)
+        with self._controller.writes.session() as session:
             row = session.get_one(AutomaticEvaluation, name)
             row.open = False
             job = session.get(Job, row.job)
@@ -181,7 +181,7 @@ class AutomaticEvaluations:
             return
         run, iterations = training.run, int(training.spec["train"]["iterations"])
         checkpoints = [each for each in list_checkpoints(run) if each.is_scheduled]
-        with self._reconciler.database.session() as session:
+        with self._controller.database.session() as session:
             job, row = session.get(Job, job_id), session.get(AutomaticEvaluation, run.name)
             if job is None or job.is_terminal or job.stop_reason is not None:
                 return
@@ -195,7 +195,7 @@ class AutomaticEvaluations:
 
     def _training(self, job_id: str) -> _Training | None:
         if job_id not in self._known:
-            with self._reconciler.database.session() as session:
+            with self._controller.database.session() as session:
                 job = session.get(Job, job_id)
                 if job is None or job.first_epoch is None:
                     return None
@@ -211,7 +211,7 @@ class AutomaticEvaluations:
         if wanted is None or job.first_epoch is None:
             return None
         owner, directory = job.owner or CONTROLLER.name, gang.options.directory
-        run, place = self._reconciler.store.run(job.run), place_of(job.queue, job.share, wanted)
+        run, place = self._controller.access.store.run(job.run), place_of(job.queue, job.share, wanted)
         return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, place, directory, wanted)
 
     @staticmethod
@@ -224,15 +224,15 @@ class AutomaticEvaluations:
 
     def _note(self, training: _Training, counted: Counted, problem: str | None = None) -> None:
         found = facts_of(training.run)
-        with self._reconciler.writing, self._reconciler.database.session() as session:
+        with self._controller.writes.session() as session:
             row = _row(session, training, counted, found)
             row.problem = problem or row.problem  # it stands until an evaluation is submitted
 
     def _submit(self, training: _Training, counted: Counted, chosen: Checkpoint) -> None:
         """Submit the evaluation, as the training's owner, in one transaction with the progress through the training's checkpoints."""
-        reconciler, run = self._reconciler, training.run
-        reconciler.check_writable(adds=True)
-        reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+        controller, run = self._controller, training.run
+        controller.writes.check(adds=True)
+        controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
         try:
             actor = self._actor_named(training.owner)
             if actor is None:
@@ -241,14 +241,14 @@ class AutomaticEvaluations:
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
             def call(known: Known) -> Job:
-                with reconciler.writing, reconciler.database.session() as session:
-                    context = Context(session, reconciler, actor, known=known)
+                with controller.writes.session() as session:
+                    context = Context(session, controller, actor, known=known)
                     job = submit(context, spec, training.directory, f"evaluation of run {run.name}", tags=tags)
                     row = _row(session, training, counted, found)
                     row.checkpoint, row.job, row.open, row.problem = chosen.name, job.id, True, None
                     return job
 
-            job = with_store(reconciler, call)
+            job = with_store(controller, call)
         except (ClientError, SpecError) as error:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)
@@ -258,7 +258,7 @@ class AutomaticEvaluations:
             )
             return
         self._backoff.worked(("evaluations of", run.name))
-        reconciler.wake()
+        controller.alarm.ring()
         passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""
         log.info("job %s evaluates %s@%d%s", job.id[:8], run.name, chosen.iteration, passed)
 

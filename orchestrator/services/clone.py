@@ -14,7 +14,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.engines.registry import FRESH
@@ -39,7 +39,7 @@ from shared_store.volume.run_settings import first_difference, fixed_settings, i
 
 
 def clone(
-    reconciler: Reconciler, actor: Actor, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
+    controller: Controller, actor: Actor, source: Run, name: str, changes: Changes, idempotency_key: str | None = None
 ) -> dict[str, Any]:
     """Submit a job whose run begins at iteration 0 with the weights of ``source``; refusals come before a job exists.
 
@@ -54,19 +54,19 @@ def clone(
         ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
             impossible, or the weights can't fit what was changed.
     """
-    with using(reconciler, source.name):
+    with using(controller, source.name):
         return with_teacher(
-            reconciler, lambda teacher: _clone(reconciler, actor, source, name, changes, idempotency_key, teacher)
+            controller, lambda teacher: _clone(controller, actor, source, name, changes, idempotency_key, teacher)
         )
 
 
-def check_clone(reconciler: Reconciler, actor: Actor, source: Run, name: str, changes: Changes) -> dict[str, Any]:
+def check_clone(controller: Controller, actor: Actor, source: Run, name: str, changes: Changes) -> dict[str, Any]:
     """The definition that :func:`clone` would register, its queue, and the run and checkpoint of its weights; nothing is submitted.
 
     Raises ClientError as :func:`clone`.
     """
-    spec, chosen = _checked(reconciler, actor, source, name, changes)
-    definition = _check_submission(reconciler, actor, spec, changes, name)
+    spec, chosen = _checked(controller, actor, source, name, changes)
+    definition = _check_submission(controller, actor, spec, changes, name)
     return {
         "definition": definition,
         "queue": spec.queue,
@@ -75,7 +75,7 @@ def check_clone(reconciler: Reconciler, actor: Actor, source: Run, name: str, ch
 
 
 def _clone(
-    reconciler: Reconciler,
+    controller: Controller,
     actor: Actor,
     source: Run,
     name: str,
@@ -84,24 +84,24 @@ def _clone(
     teacher: TeacherCopy | None,
 ) -> dict[str, Any]:
     def answered_before(known: Known) -> dict[str, Any] | None:
-        with reconciler.database.session() as session:
-            return _answered(Context(session, reconciler, actor, idempotency_key, known=known), name)
+        with controller.database.session() as session:
+            return _answered(Context(session, controller, actor, idempotency_key, known=known), name)
 
-    if earlier := with_store(reconciler, answered_before):
+    if earlier := with_store(controller, answered_before):
         return earlier
-    spec, chosen = _checked(reconciler, actor, source, name, changes)
-    new = reconciler.store.run(name)
-    _check_submission(reconciler, actor, spec, changes, name)  # before the copy: not for who may not submit it
-    reconciler.check_writable(adds=True)
-    keep_again(reconciler, actor, source, spec.document())
-    if shortage := reconciler.disk.shortage("store"):
+    spec, chosen = _checked(controller, actor, source, name, changes)
+    new = controller.access.store.run(name)
+    _check_submission(controller, actor, spec, changes, name)  # before the copy: not for who may not submit it
+    controller.writes.check(adds=True)
+    keep_again(controller, actor, source, spec.document())
+    if shortage := controller.access.shortage():
         raise ClientError(f"{shortage}; a clone has a copy of the weights", 503)
-    making = NewRun(reconciler.store, reconciler.peers.id, source.name, chosen)
+    making = NewRun(controller.access.store, controller.access.peers.id, source.name, chosen)
     environment = {"MUSTER_RUN": name, "MUSTER_PARENT": f"{source.name}@{chosen.iteration}"}
 
     def begin(known: Known) -> dict[str, Any]:
-        with reconciler.writing, reconciler.database.session() as session:
-            context = Context(session, reconciler, actor, idempotency_key, making, teacher, known)
+        with controller.writes.session() as session:
+            context = Context(session, controller, actor, idempotency_key, making, teacher, known)
             if earlier := _answered(context, name):
                 return earlier
             _check_free(session, new, context.read("taken", partial(_is_taken, new)))
@@ -118,40 +118,40 @@ def _clone(
                 making.copy()
             except DamagedCheckpoint as error:
                 raise refusal(source, chosen, error) from None
-            answer = with_store(reconciler, begin)
+            answer = with_store(controller, begin)
     except RunExists:
         raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
     finally:
-        release(reconciler, making)
-    reconciler.wake()
+        release(controller, making)
+    controller.alarm.ring()
     return answer
 
 
-def _checked(reconciler: Reconciler, actor: Actor, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
+def _checked(controller: Controller, actor: Actor, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
     """The spec of the new run, and the checkpoint with its weights. Raises ClientError."""
     found = facts_of(source)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         spec = _changed(session, actor, found, name, changes)
-        new = Context(session, reconciler, actor).run(name)
+        new = Context(session, controller, actor).run(name)
     is_taken = _is_taken(new)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         _check_free(session, new, is_taken)
     chosen = _choose(source, changes)
     _check_weights(source, chosen, spec)
     return spec, chosen
 
 
-def _check_submission(reconciler: Reconciler, actor: Actor, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
+def _check_submission(controller: Controller, actor: Actor, spec: Spec, changes: Changes, name: str) -> dict[str, Any]:
     """The definition of the job, which may be submitted. Raises ClientError."""
-    reconciler.engine.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
+    controller.engines.capacity(patience=FRESH)  # before a lock: its holder must not wait for an engine
 
     def call(known: Known) -> dict[str, Any]:
-        with reconciler.database.session() as session:
-            return check(Context(session, reconciler, actor, known=known), spec, changes.directory, f"clone {name}")
+        with controller.database.session() as session:
+            return check(Context(session, controller, actor, known=known), spec, changes.directory, f"clone {name}")
 
-    return with_store(reconciler, call)
+    return with_store(controller, call)
 
 
 def _answered(context: Context, name: str) -> dict[str, Any] | None:

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ClientError, RequestError
@@ -44,7 +44,7 @@ class StoreNeeded(RequestError):
         self.key, self.body = key, body
 
 
-def with_store(reconciler: Reconciler, call: Callable[[Known], T]) -> T:
+def with_store(controller: Controller, call: Callable[[Known], T]) -> T:
     """Carry out a call that may need to know something of the store. That is read while neither the database nor a lock is held.
 
     Raises what the call raises, StoreSilent.
@@ -54,13 +54,13 @@ def with_store(reconciler: Reconciler, call: Callable[[Known], T]) -> T:
         try:
             return call(known)
         except StoreNeeded as needed:
-            known[needed.key] = reconciler.calls.call(partial(_outcome, needed.body))
+            known[needed.key] = controller.access.calls.call(partial(_outcome, needed.body))
 
 
-def release(reconciler: Reconciler, copy: WeightsCopy) -> None:
+def release(controller: Controller, copy: WeightsCopy) -> None:
     """Let others write the run that :meth:`Context.publish` gave this copy: it stands in the database, or the copy was taken back."""
-    for name in [name for name, by in list(reconciler.beginning.items()) if by is copy]:
-        del reconciler.beginning[name]
+    for name in [name for name, by in list(controller.access.beginning.items()) if by is copy]:
+        del controller.access.beginning[name]
 
 
 def _outcome(body: Callable[[], T]) -> Callable[[], T]:
@@ -82,7 +82,7 @@ class Context:
     """One call."""
 
     session: Session
-    reconciler: Reconciler
+    controller: Controller
     actor: Actor
     idempotency_key: str | None = None
     making: NewRun | None = None
@@ -101,7 +101,7 @@ class Context:
 
     def publish(self, name: str, copy: WeightsCopy, body: Callable[[], Any]) -> None:
         """Have ``body`` put a copy into the run, which nobody else gets until :func:`release`. Raises StoreNeeded, and what it raises."""
-        self.reconciler.beginning[name] = copy
+        self.controller.access.beginning[name] = copy
         self.read(("publish", name), body)
 
     def found(self, name: str) -> RunFacts:
@@ -140,13 +140,13 @@ class Context:
     def run(self, name: str) -> Run:
         """The run of that name, whether it exists or not. Raises ClientError where no run can have it."""
         try:
-            return self.reconciler.store.run(name)
+            return self.controller.access.store.run(name)
         except StoreError as error:
             raise ClientError(str(error)) from None
 
     def reason(self, job: Job) -> str | None:
         """The job's ``statusReason`` in the AWS Batch API; None before it has one."""
-        return self.reconciler.admission.reason(job).aws or None
+        return self.controller.admission.reason(job).aws or None
 
 
 def named_definition(session: Session, arn: str) -> JobDefinition | None:
@@ -161,24 +161,24 @@ def queue_names(session: Session, actor: Actor) -> list[str]:
     return [name for name in names if actor.may_see(JobsOf(name))]
 
 
-def find_run(reconciler: Reconciler, actor: Actor, name: str) -> Run:
+def find_run(controller: Controller, actor: Actor, name: str) -> Run:
     """The run called ``name``. Raises ClientError (404) naming its job, where that never started, or the nearest run; StoreSilent."""
-    run = _run(reconciler, name)
+    run = _run(controller, name)
     if run.description() is None:
-        raise _absent(reconciler, actor, name)
+        raise _absent(controller, actor, name)
     return run
 
 
 @contextmanager
-def using(reconciler: Reconciler, *runs: str, cites: bool = True) -> Iterator[None]:
+def using(controller: Controller, *runs: str, cites: bool = True) -> Iterator[None]:
     """A block in which nobody deletes these runs; ``cites``: afterwards something in the store may need them. Raises RunInUse."""
     with ExitStack() as stack:
         for run in runs:
-            stack.enter_context(reconciler.run_users.using(run))
+            stack.enter_context(controller.access.users.using(run))
         if (
             cites
         ):  # must run before the runs are released, so that retention looks at the store again before it takes one
-            stack.callback(reconciler.retention.stored.look_again)
+            stack.callback(controller.retention.stored.look_again)
         yield
 
 
@@ -189,17 +189,17 @@ def archived(run: str) -> ClientError:
     )
 
 
-def _run(reconciler: Reconciler, name: str) -> Run:
+def _run(controller: Controller, name: str) -> Run:
     try:
-        return reconciler.store.run(name)
+        return controller.access.store.run(name)
     except StoreError as error:
         raise ClientError(str(error)) from None
 
 
-def _absent(reconciler: Reconciler, actor: Actor, name: str) -> ClientError:
+def _absent(controller: Controller, actor: Actor, name: str) -> ClientError:
     """The actor sees no run called ``name``; what it may see is named. Raises StoreSilent."""
-    reconciler.check_store()
-    with reconciler.database.session() as session:
+    controller.access.check()
+    with controller.database.session() as session:
         query = select(Job).where(Job.run == name, Job.first_epoch.is_(None)).order_by(Job.created_at.desc())
         job = session.scalars(query.limit(1)).first()
         if job is not None and actor.may_see(job) and job.kind == "array":
@@ -213,10 +213,10 @@ def _absent(reconciler: Reconciler, actor: Actor, name: str) -> ClientError:
             return ClientError(f"{name} is a job, not a run; {_runs_of_array(session, named)}", 404)
         if named is not None:
             return ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
-    runs = [each.name for each in visible_runs(reconciler, actor, most=_COMPARED)]
+    runs = [each.name for each in visible_runs(controller, actor, most=_COMPARED)]
     others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
     hint = nearest(name, runs, others, cutoff=0.3)
-    return ClientError(f"run {name} does not exist in {reconciler.store.path}; {hint}", 404)
+    return ClientError(f"run {name} does not exist in {controller.access.store.path}; {hint}", 404)
 
 
 def _runs_of_array(session: Session, array: Job) -> str:
@@ -231,25 +231,25 @@ def _runs_of_array(session: Session, array: Job) -> str:
     return f"job {reasons.named(array.name, array.id)} is an array; its children have the runs {array.run}-0 to {array.run}-{last}; {such}"
 
 
-def permitted_run(reconciler: Reconciler, actor: Actor, name: str, operation: Operation) -> Run:
+def permitted_run(controller: Controller, actor: Actor, name: str, operation: Operation) -> Run:
     """The run called ``name``, where the actor may do this to it; another's is as if it did not exist. Raises ClientError."""
-    owner = owner_of_run(reconciler, _run(reconciler, name))
+    owner = owner_of_run(controller, _run(controller, name))
     if owner is not None:
         if not actor.may_see(owner):
-            raise _absent(reconciler, actor, name)
+            raise _absent(controller, actor, name)
         actor.check(operation, owner)
-    return find_run(reconciler, actor, name)
+    return find_run(controller, actor, name)
 
 
-def owner_of_run(reconciler: Reconciler, run: Run) -> RunRecord | None:
+def owner_of_run(controller: Controller, run: Run) -> RunRecord | None:
     """:func:`owner_of`, for a run that is not read yet. Raises OSError."""
     found = facts_of(run)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         return owner_of(session, found)
 
 
 def visible_runs(
-    reconciler: Reconciler,
+    controller: Controller,
     actor: Actor,
     after: str = "",
     most: int | None = None,
@@ -259,7 +259,7 @@ def visible_runs(
     """The runs of the store that the actor may see, by name.
 
     Args:
-        reconciler: The controller.
+        controller: The controller.
         actor: Who asks.
         after: Those behind this name.
         most: At most so many.
@@ -268,12 +268,12 @@ def visible_runs(
     """
     restricted = actor.queues is not None
     wanted = search.lower()
-    found = reconciler.store.runs(
+    found = controller.access.store.runs(
         after, None if restricted else most, lambda run: wanted in run.name.lower() and among(run)
     )
     if not restricted:
         return found
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         recorded = {record.name: record for record in session.scalars(select(RunRecord))}
-    owned = ((run, recorded.get(run.name) or owner_of_run(reconciler, run)) for run in found)
+    owned = ((run, recorded.get(run.name) or owner_of_run(controller, run)) for run in found)
     return list(islice((run for run, owner in owned if owner is not None and actor.may_see(owner)), most))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.persistence.models import Job
@@ -17,11 +17,11 @@ from orchestrator.spec.model import validate
 from shared_store.volume.layout import Run
 
 
-def evaluate(reconciler: Reconciler, actor: Actor, run: Run, section: Mapping[str, Any], directory: str) -> Job:
+def evaluate(controller: Controller, actor: Actor, run: Run, section: Mapping[str, Any], directory: str) -> Job:
     """Submit a job that evaluates a checkpoint.
 
     Args:
-        reconciler: The controller.
+        controller: The controller.
         actor: Who asks; must be allowed to read the run.
         run: Of the training.
         section: What ``evaluate`` says beside the run.
@@ -30,40 +30,40 @@ def evaluate(reconciler: Reconciler, actor: Actor, run: Run, section: Mapping[st
     Raises:
         ClientError: The run is no training, or the job can't be submitted.
     """
-    document = evaluation_document(run.name, _trained(reconciler, actor, run), section)
-    return _submitted(reconciler, actor, document, directory, f"evaluation of {run.name}")
+    document = evaluation_document(run.name, _trained(controller, actor, run), section)
+    return _submitted(controller, actor, document, directory, f"evaluation of {run.name}")
 
 
-def export(reconciler: Reconciler, actor: Actor, run: Run, section: Mapping[str, Any], directory: str) -> Job:
+def export(controller: Controller, actor: Actor, run: Run, section: Mapping[str, Any], directory: str) -> Job:
     """Submit a job that exports a checkpoint's policy; as :func:`evaluate`."""
-    return _beside(reconciler, actor, run, "export", section, directory)
+    return _beside(controller, actor, run, "export", section, directory)
 
 
-def record(reconciler: Reconciler, actor: Actor, run: Run, section: Mapping[str, Any], directory: str) -> Job:
+def record(controller: Controller, actor: Actor, run: Run, section: Mapping[str, Any], directory: str) -> Job:
     """Submit a job that records a checkpoint's policy at work; as :func:`evaluate`."""
-    return _beside(reconciler, actor, run, "record", section, directory)
+    return _beside(controller, actor, run, "record", section, directory)
 
 
 def _beside(
-    reconciler: Reconciler, actor: Actor, run: Run, kind: str, section: Mapping[str, Any], directory: str
+    controller: Controller, actor: Actor, run: Run, kind: str, section: Mapping[str, Any], directory: str
 ) -> Job:
-    document = document_beside(run.name, _trained(reconciler, actor, run), kind, section)
-    return _submitted(reconciler, actor, document, directory, f"{kind} of {run.name}")
+    document = document_beside(run.name, _trained(controller, actor, run), kind, section)
+    return _submitted(controller, actor, document, directory, f"{kind} of {run.name}")
 
 
-def _trained(reconciler: Reconciler, actor: Actor, run: Run) -> Mapping[str, Any]:
+def _trained(controller: Controller, actor: Actor, run: Run) -> Mapping[str, Any]:
     """The spec of a training. Raises ClientError where the run is none."""
     found = facts_of(run)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         spec = spec_of(session, actor, found) or {}
     if not spec.get("train"):
         raise ClientError(f"run {run.name} is no training, so it has no policy")
     return spec
 
 
-def _submitted(reconciler: Reconciler, actor: Actor, document: Mapping[str, Any], directory: str, what: str) -> Job:
+def _submitted(controller: Controller, actor: Actor, document: Mapping[str, Any], directory: str, what: str) -> Job:
     try:
         spec = validate(dict(document), what)
     except SpecError as error:
         raise ClientError(str(error)) from None
-    return submit_spec(reconciler, actor, spec, directory, what)
+    return submit_spec(controller, actor, spec, directory, what)

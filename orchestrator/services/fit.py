@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from sqlalchemy.orm import Session
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.gang import GangSpec, gang_needs
@@ -18,10 +18,10 @@ from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
 
 
-def fit_of(session: Session, actor: Actor, reconciler: Reconciler, queue: JobQueue, gang: GangSpec) -> Fit:
+def fit_of(session: Session, actor: Actor, controller: Controller, queue: JobQueue, gang: GangSpec) -> Fit:
     """The answer of an idle queue to a job; a training whose automatic evaluations could never start has a problem, too."""
-    found = fit_in_queue(session, reconciler.engine, queue, gang.shape)
-    if found.problem or not (problem := _problem_of_evaluations(session, actor, reconciler, queue, gang)):
+    found = fit_in_queue(session, controller.engines, queue, gang.shape)
+    if found.problem or not (problem := _problem_of_evaluations(session, actor, controller, queue, gang)):
         return found
     return Fit(None, f"evaluation: {problem}")
 
@@ -43,7 +43,7 @@ def named_queue(session: Session, actor: Actor, name: str) -> JobQueue:
 
 
 def _problem_of_evaluations(
-    session: Session, actor: Actor, reconciler: Reconciler, queue: JobQueue, gang: GangSpec
+    session: Session, actor: Actor, controller: Controller, queue: JobQueue, gang: GangSpec
 ) -> str | None:
     """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
     try:
@@ -54,6 +54,6 @@ def _problem_of_evaluations(
         spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
         definition = compile_definition(spec, gang.options.directory)
         shape = gang_needs(definition["nodeProperties"]).shape
-        return fit_in_queue(session, reconciler.engine, named_queue(session, actor, place["queue"]), shape).problem
+        return fit_in_queue(session, controller.engines, named_queue(session, actor, place["queue"]), shape).problem
     except (ClientError, SpecError) as error:
         return str(error)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 import time
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.services.context import visible_runs
 from orchestrator.services.permissions import Actor
 from shared_store.volume.files import DamagedFile
@@ -15,9 +15,9 @@ _KEPT = 600.0
 """Seconds for which the parent of a run is not read again: it changes only where the run is replaced by another of its name."""
 
 
-def clones_of(reconciler: Reconciler, actor: Actor, run: Run) -> list[str]:
+def clones_of(controller: Controller, actor: Actor, run: Run) -> list[str]:
     """The runs that began with weights of ``run`` and that the caller may see, by name."""
-    return [each.name for each in visible_runs(reconciler, actor) if _parents.of(each) == run.name]
+    return [each.name for each in visible_runs(controller, actor) if _parents.of(each) == run.name]
 
 
 class _Parents:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.models import RunRecord
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
@@ -18,7 +18,7 @@ from shared_store.volume.models import AlreadyRegistered, Model, ModelError, Unk
 
 
 def register(
-    reconciler: Reconciler,
+    controller: Controller,
     actor: Actor,
     run_name: str,
     name: str,
@@ -29,7 +29,7 @@ def register(
     """Keep the exported bundle of a checkpoint as the next version of a model.
 
     Args:
-        reconciler: The controller.
+        controller: The controller.
         actor: Who asks.
         run_name: The run of the checkpoint.
         name: Of the model.
@@ -39,22 +39,24 @@ def register(
     Raises:
         ClientError: There is no such checkpoint or no bundle of it, or the model is another's.
     """
-    run = permitted_run(reconciler, actor, run_name, Operation.REGISTER_MODEL)
-    reconciler.check_writable(adds=True)
-    if shortage := reconciler.disk.shortage("store"):
+    run = permitted_run(controller, actor, run_name, Operation.REGISTER_MODEL)
+    controller.writes.check(adds=True)
+    if shortage := controller.access.shortage():
         raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
     checkpoint = choose(run, wanted)
     if checkpoint is None:
         raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
-    record = owner_of_run(reconciler, run)
+    record = owner_of_run(controller, run)
     queue, owner = (record.queue, record.owner) if record else ("", None)
     try:
-        with using(reconciler, run.name):
-            there = models.versions(reconciler.store, name)
+        with using(controller, run.name):
+            there = models.versions(controller.access.store, name)
             if there:
                 actor.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
             facts = {"queue": queue, "owner": owner, "registered_by": actor.name}
-            return models.register(reconciler.store, name, run, checkpoint, facts, reconciler.peers.id, again=again)
+            return models.register(
+                controller.access.store, name, run, checkpoint, facts, controller.access.peers.id, again=again
+            )
     except AlreadyRegistered as error:
         raise ClientError(str(error), CONFLICT) from None
     except ModelError as error:
@@ -65,21 +67,21 @@ def register(
         raise ClientError(f"model {name} can't be written ({error.strerror or error})", 503) from None
 
 
-def find_model(reconciler: Reconciler, actor: Actor, name: str, version: int | None) -> Model:
+def find_model(controller: Controller, actor: Actor, name: str, version: int | None) -> Model:
     """A version of a model that the caller may see, the newest where none is named. Raises ClientError."""
     try:
-        return models.find(reconciler.store, name, version, lambda model: actor.may_see(owner_of_model(model)))
+        return models.find(controller.access.store, name, version, lambda model: actor.may_see(owner_of_model(model)))
     except UnknownModel as error:
         raise ClientError(str(error), 404) from None
     except (ModelError, DamagedFile) as error:
         raise ClientError(str(error)) from None
 
 
-def entered_model(reconciler: Reconciler, entry: Mapping[str, Any]) -> Model:
+def entered_model(controller: Controller, entry: Mapping[str, Any]) -> Model:
     """The model of a league's entry, which every key may see with its league. Raises ClientError."""
     name, version = entry["model"]["name"], entry["model"]["version"]
     try:
-        return next(model for model in models.versions(reconciler.store, name) if model.version == version)
+        return next(model for model in models.versions(controller.access.store, name) if model.version == version)
     except StopIteration:
         raise ClientError(f"model {name}@{version} is not in the store any more", 404) from None
     except (ModelError, DamagedFile) as error:

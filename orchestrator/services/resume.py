@@ -9,7 +9,7 @@ from typing import Any
 
 from sqlalchemy.orm import Session
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.job import Status
@@ -38,7 +38,7 @@ _RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": (
 
 
 def resume(
-    reconciler: Reconciler, actor: Actor, run: Run, changes: Changes, idempotency_key: str | None = None
+    controller: Controller, actor: Actor, run: Run, changes: Changes, idempotency_key: str | None = None
 ) -> dict[str, Any]:
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
@@ -51,14 +51,14 @@ def resume(
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
-    with using(reconciler, run.name, cites=False):
+    with using(controller, run.name, cites=False):
         return with_teacher(
-            reconciler, lambda teacher: _resume(reconciler, actor, run, changes, idempotency_key, teacher)
+            controller, lambda teacher: _resume(controller, actor, run, changes, idempotency_key, teacher)
         )
 
 
 def _resume(
-    reconciler: Reconciler,
+    controller: Controller,
     actor: Actor,
     run: Run,
     changes: Changes,
@@ -70,13 +70,13 @@ def _resume(
         raise ClientError(f"run {run.name} was deleted a moment ago", 404)
     if is_archived(run):
         raise archived(run.name)
-    with reconciler.database.session() as session:
-        if earlier := _answered(Context(session, reconciler, actor, idempotency_key), found, checkpoints):
+    with controller.database.session() as session:
+        if earlier := _answered(Context(session, controller, actor, idempotency_key), found, checkpoints):
             return earlier
         document = spec_of(session, actor, found)
     with suppress(SpecError, ClientError):  # refused below, with its reason
         document = override(document or {}, changes.all())
-    keep_again(reconciler, actor, run, document)
+    keep_again(controller, actor, run, document)
     chosen = choose(run, changes.checkpoint)
     if chosen is not None:
         with suppress(DamagedCheckpoint):
@@ -86,12 +86,12 @@ def _resume(
             chosen.verify()  # reads all of it
         except DamagedCheckpoint as error:
             raise refusal(run, chosen, error) from None
-    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    reconciler.check_writable(adds=True)
+    controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    controller.writes.check(adds=True)
 
     def begin(known: Known) -> dict[str, Any]:
-        with reconciler.writing, reconciler.database.session() as session:
-            context = Context(session, reconciler, actor, idempotency_key, teacher=teacher, known=known)
+        with controller.writes.session() as session:
+            context = Context(session, controller, actor, idempotency_key, teacher=teacher, known=known)
             if earlier := _answered(context, found, checkpoints):
                 return earlier
             document = spec_of(session, actor, found)
@@ -123,8 +123,8 @@ def _resume(
                 "kind": spec.kind,
             }
 
-    answer = with_store(reconciler, begin)
-    reconciler.wake()
+    answer = with_store(controller, begin)
+    controller.alarm.ring()
     return answer
 
 

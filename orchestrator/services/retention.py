@@ -6,7 +6,7 @@ import time
 from dataclasses import replace
 from typing import Any
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.retention import RunNeeded
 from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.domain.errors import ClientError
@@ -19,18 +19,18 @@ _A_PART = 2.0
 """Seconds of an answer: the rest of a pass comes with the next ones."""
 
 
-def archive(reconciler: Reconciler, actor: Actor, name: str, *, archived: bool) -> None:
+def archive(controller: Controller, actor: Actor, name: str, *, archived: bool) -> None:
     """Archive a run, or take it out again.
 
     Raises:
         ClientError: There is no such run, or it is not the actor's.
         RunNeeded: A job that has not ended uses it.
     """
-    run = permitted_run(reconciler, actor, name, Operation.ARCHIVE_RUN)
-    with reconciler.retention.alone(run.name):
-        if reconciler.retention.stored.facts([run.name])[run.name] is None:
+    run = permitted_run(controller, actor, name, Operation.ARCHIVE_RUN)
+    with controller.retention.alone(run.name):
+        if controller.retention.stored.facts([run.name])[run.name] is None:
             raise ClientError(f"run {run.name} was deleted a moment ago", 404)
-        if archived and (job := reconciler.retention.open_job(run.name)):
+        if archived and (job := controller.retention.open_job(run.name)):
             raise RunNeeded(
                 f"run {run.name} is not archived, since job {job} has not ended; stop it first: muster stop {job}"
             )
@@ -40,23 +40,23 @@ def archive(reconciler: Reconciler, actor: Actor, name: str, *, archived: bool) 
             contents.unarchive(run)
 
 
-def delete(reconciler: Reconciler, actor: Actor, name: str) -> dict[str, Any]:
+def delete(controller: Controller, actor: Actor, name: str) -> dict[str, Any]:
     """Delete a run with all that it holds, where nothing needs it; its size, and where in the trash is what can't be removed.
 
     Raises:
         ClientError: There is no such run, or it is not the actor's.
         RunNeeded: Something needs it.
     """
-    run = permitted_run(reconciler, actor, name, Operation.DELETE_RUN)
-    reconciler.check_writable(adds=False)
-    return reconciler.retention.delete(run.name, Whose(actor.name, actor.queues))
+    run = permitted_run(controller, actor, name, Operation.DELETE_RUN)
+    controller.writes.check(adds=False)
+    return controller.retention.delete(run.name, Whose(actor.name, actor.queues))
 
 
-def next_part(reconciler: Reconciler, actor: Actor, after: str, older_than: str, *, take: bool) -> dict[str, Any]:
+def next_part(controller: Controller, actor: Actor, after: str, older_than: str, *, take: bool) -> dict[str, Any]:
     """The next part of a pass over the actor's jobs and runs.
 
     Args:
-        reconciler: The controller.
+        controller: The controller.
         actor: Who asks.
         after: ``next`` of the part before; empty at first.
         older_than: Age in place of the rules' default, such as ``30d``; empty as the rules say.
@@ -68,7 +68,7 @@ def next_part(reconciler: Reconciler, actor: Actor, after: str, older_than: str,
     """
     if take:
         actor.check(Operation.TAKE_GARBAGE)
-        reconciler.check_writable(adds=False)
+        controller.writes.check(adds=False)
     whose = Whose(actor.name, actor.queues)
     try:
         place = Place.of(after) if after else Place()
@@ -79,13 +79,13 @@ def next_part(reconciler: Reconciler, actor: Actor, after: str, older_than: str,
     except ValueError as error:
         raise ClientError(f"older_than: {error}") from None
     if not after:
-        reconciler.retention.stored.look_again()  # others may have changed the store
+        controller.retention.stored.look_again()  # others may have changed the store
     found: list[dict[str, Any]] = []
     deadline = time.monotonic() + _A_PART
     while True:
-        rules = reconciler.retention.rules()
+        rules = controller.retention.rules()
         rules = rules if older is None else replace(rules, default=older)
-        looks, following = reconciler.retention.step(place, rules, take=take, whose=whose)
+        looks, following = controller.retention.step(place, rules, take=take, whose=whose)
         found += looks
         if following is None or time.monotonic() > deadline:
             return {"runs": found, "next": None if following is None else str(following)}

@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.persistence.models import Job, RunRecord
@@ -27,30 +27,30 @@ from shared_store.volume.metrics import sampled
 
 
 def list_runs(
-    reconciler: Reconciler, actor: Actor, after: str, most: int, search: str = "", archived: bool = False
+    controller: Controller, actor: Actor, after: str, most: int, search: str = "", archived: bool = False
 ) -> list[dict[str, Any]]:
     """The first ``most`` runs behind the name ``after``, with ``search`` in their names, that the caller may see: those that are archived, or not.
 
     One that can't be read has a ``problem`` instead of its facts.
     """
     stored: list[StoredRun | dict[str, Any]] = []
-    for run in visible_runs(reconciler, actor, after, most, search.strip(), lambda run: is_archived(run) == archived):
+    for run in visible_runs(controller, actor, after, most, search.strip(), lambda run: is_archived(run) == archived):
         try:
             stored.append(stored_run(run))
         except (DamagedFile, OSError) as error:
             problem = excerpt(" ".join(str(error).split()), LONGEST_REASON)
             stored.append({"run": run.name, "path": str(run.path), "problem": problem})
     names = [each.found.name for each in stored if isinstance(each, StoredRun)]
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         # one query instead of one a run: the session looks here first
         _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(names))).all()
         return [described(session, actor, each) if isinstance(each, StoredRun) else each for each in stored]
 
 
-def describe_run(reconciler: Reconciler, actor: Actor, run: Run) -> dict[str, Any]:
+def describe_run(controller: Controller, actor: Actor, run: Run) -> dict[str, Any]:
     """Facts of a run: its jobs, its newest checkpoint, and where its results lie. Raises DamagedFile, OSError."""
     stored = stored_run(run)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         return described(session, actor, stored)
 
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.models import RunRecord
@@ -71,7 +71,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
     Returns:
         The teacher's weights, where the job's run has to hold a copy of them.
     """
-    store, spec = context.reconciler.store, gang.spec
+    store, spec = context.controller.access.store, gang.spec
     check_tracks(store, spec, context.read)
     teacher = None
     mains = set(_sources(gang.nodes[gang.main]))
@@ -79,11 +79,11 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
         is_teacher = source.key == _TEACHER
         if is_teacher and context.read(("held", source), partial(_is_held, context, gang, source)):
             continue
-        context.reconciler.run_users.check(source.run)
+        context.controller.access.users.check(source.run)
         if not is_waiting:
             try:
-                found = partial(permitted_run, context.reconciler, context.actor, source.run, Operation.SUBMIT_JOB)
-                version = context.reconciler.run_users.version(source.run)
+                found = partial(permitted_run, context.controller, context.actor, source.run, Operation.SUBMIT_JOB)
+                version = context.controller.access.users.version(source.run)
                 run = context.read(("find", source.run, version), found)
                 if not is_teacher and context.read(("archived", source.run, version), partial(is_archived, run)):
                     raise archived(source.run)
@@ -104,7 +104,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
     return teacher
 
 
-def with_teacher(reconciler: Reconciler, submit: Callable[[TeacherCopy | None], T]) -> T:
+def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], T]) -> T:
     """Submit a job; the weights that its policy will imitate are copied first, without holding the database.
 
     Raises ClientError.
@@ -117,17 +117,17 @@ def with_teacher(reconciler: Reconciler, submit: Callable[[TeacherCopy | None], 
         return submit(None)
     except TeacherNeeded as error:
         needed = error
-    if shortage := reconciler.disk.shortage("store"):
+    if shortage := controller.access.shortage():
         raise ClientError(f"{shortage}; the run has a copy of its teacher's weights", 503)
-    copy = TeacherCopy(reconciler.store, reconciler.peers.id, needed.run, needed.checkpoint)
+    copy = TeacherCopy(controller.access.store, controller.access.peers.id, needed.run, needed.checkpoint)
     tidy = copy.discard
 
     def end() -> None:
         tidy()  # waits for a copy that hangs
-        release(reconciler, copy)
+        release(controller, copy)
 
     try:
-        reconciler.calls.call(partial(copy.copy, "teacher"), works=True)
+        controller.access.calls.call(partial(copy.copy, "teacher"), works=True)
         answer = submit(copy)
         tidy = copy.close
         return answer
@@ -136,7 +136,7 @@ def with_teacher(reconciler: Reconciler, submit: Callable[[TeacherCopy | None], 
     except OSError as error:
         raise ClientError(f"{_TEACHER}: the weights can't be copied ({error.strerror or error})", 503) from None
     finally:
-        reconciler.calls.later(end)
+        controller.access.calls.later(end)
 
 
 def hold_teacher(context: Context, run: str, needed: TeacherNeeded) -> None:

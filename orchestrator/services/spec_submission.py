@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from sqlalchemy.orm import Session
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec, gang_needs
@@ -81,7 +81,7 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
     context.actor.check(Operation.SUBMIT_JOB, JobsOf(named_queue(context.session, context.actor, spec.queue).name))
-    check_tracks(context.reconciler.store, spec.document(), context.read)
+    check_tracks(context.controller.access.store, spec.document(), context.read)
     if len(json.dumps(definition).encode()) > LARGEST_DEFINITION:
         raise ClientError(
             f"the job's definition has more than {LARGEST_DEFINITION} bytes; shorten its environment and its command",
@@ -107,7 +107,7 @@ class Unfit(ClientError):
 
 
 def _check_fit(context: Context, spec: Spec, queue: JobQueue, gang: GangSpec, what: str) -> None:
-    if problem := fit_of(context.session, context.actor, context.reconciler, queue, gang).problem:
+    if problem := fit_of(context.session, context.actor, context.controller, queue, gang).problem:
         raise Unfit(problem, what, on_gpus=bool(spec.train and spec.resources.gpus))
 
 
@@ -164,7 +164,7 @@ def submit(
 
 
 def submit_spec(
-    reconciler: Reconciler,
+    controller: Controller,
     actor: Actor,
     spec: Spec,
     directory: str,
@@ -180,21 +180,21 @@ def submit_spec(
         Unavailable: The store, the database or an engine does not answer.
     """
     for text in long_texts(spec):
-        reconciler.calls.call(partial(reconciler.texts.keep, text.encode(), actor.name), works=True)
-    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    reconciler.check_writable(adds=True)
+        controller.access.calls.call(partial(controller.texts.keep, text.encode(), actor.name), works=True)
+    controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    controller.writes.check(adds=True)
 
     def with_copy(teacher: TeacherCopy | None) -> Job:
         def call(known: Known) -> Job:
             def submit_once(session: Session) -> Job:
-                context = Context(session, reconciler, actor, idempotency_key, teacher=teacher, known=known)
+                context = Context(session, controller, actor, idempotency_key, teacher=teacher, known=known)
                 earlier = submission.answered(context)
                 return earlier or submit(context, spec, directory, what, environment)
 
-            return reconciler.submissions.call(submit_once)
+            return controller.writes.gather(submit_once)
 
-        return with_store(reconciler, call)
+        return with_store(controller, call)
 
-    job = with_teacher(reconciler, with_copy)
-    reconciler.wake()
+    job = with_teacher(controller, with_copy)
+    controller.alarm.ring()
     return job

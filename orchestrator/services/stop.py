@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from sqlalchemy import or_
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.persistence.models import Job
@@ -48,12 +48,12 @@ def check_reason(reason: str, operation: Operation) -> None:
         raise ClientError(f"{operation}: the reason is longer than {LONGEST_REASON} characters")
 
 
-def stop(reconciler: Reconciler, actor: Actor, job_ids: Sequence[str], reason: str) -> dict[str, ClientError]:
+def stop(controller: Controller, actor: Actor, job_ids: Sequence[str], reason: str) -> dict[str, ClientError]:
     """Ask jobs to end, in one transaction; returns why some were not asked, by their ids. One that is not there counts as ended."""
-    reconciler.check_writable(adds=False)
+    controller.writes.check(adds=False)
     refused: dict[str, ClientError] = {}
-    with reconciler.writing, reconciler.database.session() as session:
-        context = Context(session, reconciler, actor)
+    with controller.writes.session() as session:
+        context = Context(session, controller, actor)
         for job_id in job_ids:
             try:
                 end(context, job_id, reason, Operation.TERMINATE_JOB)
@@ -61,5 +61,5 @@ def stop(reconciler: Reconciler, actor: Actor, job_ids: Sequence[str], reason: s
                 continue
             except ClientError as error:
                 refused[job_id] = error
-    reconciler.wake()
+    controller.alarm.ring()
     return refused

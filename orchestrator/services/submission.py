@@ -220,7 +220,7 @@ def _check_commands(context: Context, wanted: Submission) -> None:
     open_node = next((node for node in wanted.gang.nodes if not node.command), None)
     if open_node is None:
         return
-    engine, queue, definition = context.reconciler.engine, wanted.queue.name, wanted.definition
+    engine, queue, definition = context.controller.engines, wanted.queue.name, wanted.definition
     if without := engine.without_images(queue_engines(context.session, queue, engine.names[0])):
         where = f"job definition {definition.name}"
         if definition.document["type"] == "multinode":
@@ -237,9 +237,9 @@ def _check_commands(context: Context, wanted: Submission) -> None:
 def _check_secrets(context: Context, queue: JobQueue, gang: GangSpec) -> None:
     containers = [node.container for node in gang.nodes if node.container.get("secrets")]
     if containers:
-        engines = queue_engines(context.session, queue.name, context.reconciler.engine.names[0])
+        engines = queue_engines(context.session, queue.name, context.controller.engines.names[0])
         try:
-            context.reconciler.engine.check_secrets(engines, containers, queue.name)
+            context.controller.engines.check_secrets(engines, containers, queue.name)
         except SecretsError as error:
             raise ClientError(str(error)) from None
 
@@ -254,8 +254,8 @@ def _check_run(context: Context, run: str, named: bool) -> None:
     restricted = named and context.actor.queues is not None
     if restricted and (owner := owner_of(context.session, context.found(run))):
         context.actor.check(Operation.SUBMIT_JOB, owner)
-    context.reconciler.run_users.check(run)
-    if context.reconciler.beginning.get(run) not in (None, context.making, context.teacher):
+    context.controller.access.users.check(run)
+    if context.controller.access.beginning.get(run) not in (None, context.making, context.teacher):
         raise ClientError(f"run {run} is being begun by another request; try again when that has its answer", 503)
     holder = context.session.scalars(select(Job).where(Job.run == run, Job.status.not_in(TERMINAL)).limit(1)).first()
     if holder and not context.actor.may_see(holder):
@@ -265,11 +265,11 @@ def _check_run(context: Context, run: str, named: bool) -> None:
             f"run {run} is being written by job {reasons.named(holder.name, holder.id)}; stop it first: muster stop {reasons.short_id(holder.id)}"
         )
     with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
-        there, version = context.run(run), context.reconciler.run_users.version(run)
+        there, version = context.run(run), context.controller.access.users.version(run)
         if not named:
             return
         writer, is_kept = context.read(
-            ("writer", run, version), lambda: (context.reconciler.peers.writer(there), is_archived(there))
+            ("writer", run, version), lambda: (context.controller.access.peers.writer(there), is_archived(there))
         )
         if writer:
             raise ClientError(f"run {run} is being written by {writer}; stop that job first")
@@ -294,7 +294,7 @@ def _add_array(context: Context, parent: Job, size: int, waits: Sequence[Wait]) 
     context.session.flush()
     free = size if not waits else 1 if all(each.kind == "SEQUENTIAL" for each in waits) else 0
     # as the controller would set it at its first look, which then has nothing to write
-    since = {"queued_since": parent.created_at - context.reconciler.clock.drift}
+    since = {"queued_since": parent.created_at - context.controller.clock.drift}
     ready = {**since, "status": Status.RUNNABLE, "status_reason": WAITING, "runnable_at": parent.created_at}
     _insert_children(context.session, parent, range(free), ready)
     _insert_children(context.session, parent, range(free, size), {**since, "status": Status.SUBMITTED})

@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from orchestrator.control.controller import Controller
 from orchestrator.control.kept_texts import references_of
-from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.persistence.models import now
@@ -26,38 +26,38 @@ def check_texts(context: Context, gang: GangSpec) -> None:
         row.used_at = now()
 
 
-def keep_again(reconciler: Reconciler, actor: Actor, run: Run, spec: Mapping[str, Any] | None) -> None:
+def keep_again(controller: Controller, actor: Actor, run: Run, spec: Mapping[str, Any] | None) -> None:
     """Keep the texts of a job that continues or clones a run, where the store has them not or no more. On a thread of the store.
 
     Raises TextRefused, Unavailable. What the run lacks, too, is refused when the job is submitted.
     """
     short, long = beside(spec or {})
     for text in long.values():  # beside a change it has no room in the definition any more
-        reconciler.texts.keep(text.encode(), actor.name)
+        controller.texts.keep(text.encode(), actor.name)
     for reference in references(short):
-        with reconciler.database.session() as session:
-            source = reconciler.texts.source(session, reference)
+        with controller.database.session() as session:
+            source = controller.texts.source(session, reference)
             is_known = session.get(KeptText, reference.sha256) is not None
         if is_known and _is_there(source, reference):
-            reconciler.texts.prolong(reference.sha256)
+            controller.texts.prolong(reference.sha256)
             continue
         try:
             text = read(run.texts, reference)
         except (TextError, OSError):
             continue
-        reconciler.texts.keep(text.encode(), actor.name)
+        controller.texts.keep(text.encode(), actor.name)
 
 
-def with_texts(reconciler: Reconciler, run: str, spec: Mapping[str, Any]) -> dict[str, Any]:
+def with_texts(controller: Controller, run: str, spec: Mapping[str, Any]) -> dict[str, Any]:
     """The spec of a job of that run with its long texts, to be shown. On a thread of the store."""
-    with reconciler.database.session() as session:
-        folders = [reconciler.texts.source(session, reference) for reference in references(spec)]
-    return resolved_spec(spec, reconciler.store.run(run).texts, *folders)
+    with controller.database.session() as session:
+        folders = [controller.texts.source(session, reference) for reference in references(spec)]
+    return resolved_spec(spec, controller.access.store.run(run).texts, *folders)
 
 
 def _kept(context: Context, reference: Reference) -> KeptText:
     row = context.session.get(KeptText, reference.sha256)
-    source = context.reconciler.texts.source(context.session, reference)
+    source = context.controller.texts.source(context.session, reference)
     if row is None or not context.read(("text", reference.sha256), partial(_is_there, source, reference)):
         raise ClientError(
             f"{reference}: the store keeps no such text; submit the job with the file itself, or upload it first: "

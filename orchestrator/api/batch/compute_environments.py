@@ -280,7 +280,7 @@ def _describe(context: Context, compute_environment: ComputeEnvironment) -> dict
 
 def _own_resources(context: Context, compute_environment: ComputeEnvironment) -> dict[str, Any]:
     """``computeResources`` of a built-in compute environment: the hosts that its engine has now."""
-    engine = context.reconciler.engine
+    engine = context.controller.engines
     served = [compute_environment.name] if compute_environment.name in engine.names else []
     cpus = int(sum(host.cpus for each in engine.capacity(served, FRESH).values() for host in each.places))
     return {

@@ -14,7 +14,7 @@ from shared_store.contract.error_text import nearest
 
 def check_engine_tags(context: Context, resource: object, tags: dict[str, str]) -> None:
     """Raises ClientError where the resource can't have these tags, for an option that is misspelt or has a wrong value."""
-    first = context.reconciler.engine.names[0]
+    first = context.controller.engines.names[0]
     if isinstance(resource, ComputeEnvironment):
         engines = [engine_named_by(tags, first)]
     elif isinstance(resource, JobQueue):
@@ -29,7 +29,7 @@ def check_engine_tags(context: Context, resource: object, tags: dict[str, str]) 
         return
     if not any(tag.startswith("muster:") for tag in tags):
         return
-    if isinstance(resource, ComputeEnvironment) and engines[0] not in (*ENGINES, *context.reconciler.engine.names):
+    if isinstance(resource, ComputeEnvironment) and engines[0] not in (*ENGINES, *context.controller.engines.names):
         raise ClientError(
             f"tag {ENGINE_TAG} is {engines[0][:100]!r}: there is no such engine; {nearest(engines[0], ENGINES)}"
         )

@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 from orchestrator.api.batch import compute_environments, definitions, jobs, queues, submission, tags
 from orchestrator.api.batch.service_model import service_model
 from orchestrator.api.http import limits
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.permissions import Actor, Operation
@@ -85,9 +85,9 @@ def validate(operation: str, request: object) -> dict[str, Any]:
 
 
 def call(
-    reconciler: Reconciler, actor: Actor, operation: str, request: object, idempotency_key: str | None = None
+    controller: Controller, actor: Actor, operation: str, request: object, idempotency_key: str | None = None
 ) -> dict[str, Any]:
-    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Reconciler.check_writable`)."""
+    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Controller.check_writable`)."""
     handler = OPERATIONS.get(operation)
     if handler is None:
         instead = next((use for part, use in _INSTEAD.items() if part in operation), None)
@@ -100,30 +100,30 @@ def call(
     permitted = Operation(operation)
     actor.check(permitted)
     if permitted.reads:
-        with reconciler.database.session() as session:
-            answer: dict[str, Any] = actor.shown(handler(Context(session, reconciler, actor), checked))
+        with controller.database.session() as session:
+            answer: dict[str, Any] = actor.shown(handler(Context(session, controller, actor), checked))
             return answer
 
     def carry_out(known: Known) -> dict[str, Any]:
-        with reconciler.writing, reconciler.database.session() as session:
-            return handler(Context(session, reconciler, actor, idempotency_key, known=known), checked)
+        with controller.writes.session() as session:
+            return handler(Context(session, controller, actor, idempotency_key, known=known), checked)
 
     def submit(teacher: TeacherCopy | None) -> dict[str, Any]:
         def call(known: Known) -> dict[str, Any]:
             def handle(session: Session) -> dict[str, Any]:
                 return handler(
-                    Context(session, reconciler, actor, idempotency_key, teacher=teacher, known=known), checked
+                    Context(session, controller, actor, idempotency_key, teacher=teacher, known=known), checked
                 )
 
-            return reconciler.submissions.call(handle)
+            return controller.writes.gather(handle)
 
-        return with_store(reconciler, call)
+        return with_store(controller, call)
 
-    reconciler.check_writable(adds=operation.startswith(_ADDING))
+    controller.writes.check(adds=operation.startswith(_ADDING))
     try:
         is_submission = operation == "SubmitJob"
-        response = with_teacher(reconciler, submit) if is_submission else with_store(reconciler, carry_out)
+        response = with_teacher(controller, submit) if is_submission else with_store(controller, carry_out)
     except IntegrityError as error:  # two calls at the same instant
         raise ClientError(f"{operation}: the database refuses it ({str(error.orig).splitlines()[0][:200]})") from None
-    reconciler.wake()
+    controller.alarm.ring()
     return response

@@ -86,7 +86,7 @@ def delete_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
     if queue.state != "DISABLED":
         raise ClientError(f"Job queue {queue.name} is ENABLED; disable it first: UpdateJobQueue with state DISABLED")
     queue.deleting = True
-    context.reconciler.drain(context.session, queue)
+    context.controller.upkeep.drain(context.session, queue)
     return {}
 
 
@@ -94,7 +94,7 @@ def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[st
     """GetJobQueueSnapshot: the first 100 RUNNABLE jobs in the order in which they will be started, and the resources in use."""
     queue = context.queue(request["jobQueue"], deleting=True)
     context.actor.check(Operation.GET_JOB_QUEUE_SNAPSHOT, JobsOf(queue.name))
-    order, times = context.reconciler.admission.front(queue.name, 100)
+    order, times = context.controller.admission.front(queue.name, 100)
     jobs = [{"jobArn": job_arn(job), "earliestTimeAtPosition": times.get(job, now())} for job in order]
     return {
         "frontOfQueue": {"jobs": jobs, "lastUpdatedAt": now()},
@@ -103,7 +103,7 @@ def get_job_queue_snapshot(context: Context, request: dict[str, Any]) -> dict[st
 
 
 def _utilization(context: Context, queue: JobQueue) -> dict[str, Any]:
-    used, by_share = utilization(open_attempts(context.session, context.reconciler.work_queue.active()), queue.name)
+    used, by_share = utilization(open_attempts(context.session, context.controller.work_queue.active()), queue.name)
     detail: dict[str, Any] = {
         "totalCapacityUsage": [{"capacityUnit": unit, "quantity": amount} for unit, amount in used.items()],
         "lastUpdatedAt": now(),

@@ -21,9 +21,9 @@ from orchestrator.api.http.limits import RateLimit, parse
 from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of
 from orchestrator.api.logs import operations as logs
 from orchestrator.api.native import routes as native
-from orchestrator.control import monitoring
+from orchestrator.control import exposition
+from orchestrator.control.controller import Controller
 from orchestrator.control.deliveries import Deliveries
-from orchestrator.control.reconciler import Reconciler
 from orchestrator.domain.errors import ClientError, RequestError, Unavailable
 from orchestrator.services.permissions import Operation
 from shared_store import __version__
@@ -39,14 +39,14 @@ BROWSER_HEADERS = [
 
 
 def create_app(
-    reconciler: Reconciler,
+    controller: Controller,
     access: Access | None = None,
     limit: RateLimit | None = None,
     deliveries: Deliveries | None = None,
 ) -> FastAPI:
     """The application over a controller; ``closing`` in its state ends the streams. Without ``access``: for loopback only."""
     app = FastAPI(title="Muster", version=__version__, docs_url=None, openapi_url="/api/openapi.json", redoc_url=None)
-    app.state.reconciler = reconciler
+    app.state.controller = controller
     app.state.deliveries = deliveries
     app.state.closing = threading.Event()
     app.include_router(native.router)
@@ -62,7 +62,7 @@ def create_app(
     @app.get("/healthz")
     async def healthz() -> JSONResponse:
         """Alive, and which version; 503 with the reason while the loop is stuck, or the database or the store can't be used."""
-        if (problem := reconciler.problem()) is not None:  # needs no thread: all of them may be busy
+        if (problem := controller.problem()) is not None:  # needs no thread: all of them may be busy
             return JSONResponse({"status": "unavailable", "message": problem, "version": __version__}, 503)
         return JSONResponse({"status": "ok", "version": __version__})
 
@@ -70,7 +70,7 @@ def create_app(
     def metrics(request: Request) -> Response:
         """Metrics for Prometheus: jobs, waits, restarts, GPU-seconds used and lost, steps a second, hosts; for keys with all queues."""
         actor_of(request).check_all_queues(Operation.READ_MONITORING)
-        return Response(monitoring.exposition(reconciler), media_type=monitoring.CONTENT_TYPE)
+        return Response(exposition.exposition(controller), media_type=exposition.CONTENT_TYPE)
 
     @app.post("/v1/{operation}", include_in_schema=False)
     async def aws_batch(operation: str, request: Request) -> JSONResponse:
@@ -78,7 +78,7 @@ def create_app(
         body = await _body(request)
         name = batch.operation_names().get(operation, operation)
         key = request.headers.get(IDEMPOTENCY_HEADER)
-        return JSONResponse(await run_in_threadpool(batch.call, reconciler, actor_of(request), name, body, key))
+        return JSONResponse(await run_in_threadpool(batch.call, controller, actor_of(request), name, body, key))
 
     @app.api_route("/v1/tags/{arn:path}", methods=["GET", "POST", "DELETE"], include_in_schema=False)
     async def aws_tags(arn: str, request: Request) -> JSONResponse:
@@ -90,7 +90,7 @@ def create_app(
         if request.method == "DELETE":
             body = {"tagKeys": request.query_params.getlist("tagKeys")}
         return JSONResponse(
-            await run_in_threadpool(batch.call, reconciler, actor_of(request), name, {**body, "resourceArn": arn})
+            await run_in_threadpool(batch.call, controller, actor_of(request), name, {**body, "resourceArn": arn})
         )
 
     @app.get("/api/docs", include_in_schema=False)
@@ -103,7 +103,7 @@ def create_app(
     async def cloudwatch_logs(request: Request) -> Response:
         """CloudWatch Logs: the operation in a header (JSON 1.1)."""
         target = request.headers.get("x-amz-target", "")
-        return await logs.answer(reconciler, actor_of(request), app.state.closing, target, lambda: _body(request))
+        return await logs.answer(controller, actor_of(request), app.state.closing, target, lambda: _body(request))
 
     return app
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from fastapi import Request
 
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.services.permissions import Actor
 
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
@@ -17,7 +17,7 @@ def actor_of(request: Request) -> Actor:
     return actor
 
 
-def reconciler_of(request: Request) -> Reconciler:
+def controller_of(request: Request) -> Controller:
     """The controller that the application serves."""
-    reconciler: Reconciler = request.app.state.reconciler
-    return reconciler
+    controller: Controller = request.app.state.controller
+    return controller

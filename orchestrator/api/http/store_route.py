@@ -33,7 +33,7 @@ class StoreRoute(APIRoute):
         handler = super().get_route_handler()
 
         async def answer(request: Request) -> Response:
-            _calls.set(request.app.state.reconciler.calls)
+            _calls.set(request.app.state.controller.access.calls)
             return await handler(request)
 
         return answer

@@ -14,7 +14,7 @@ from orchestrator.api.batch.rules import check_tags
 from orchestrator.api.logs.errors import LogsError, absent, invalid, present
 from orchestrator.api.logs.events import stored_bytes
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups
@@ -68,7 +68,7 @@ def _group(session: Session, actor: Actor, reference: str, operation: Operation)
 # -- what is read -----------------------------------------------------------------------------------------------------
 
 
-def describe_log_groups(reconciler: Reconciler, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
+def describe_log_groups(controller: Controller, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeLogGroups: by name, those that fit the request."""
     prefix, pattern = request.get("logGroupNamePrefix"), request.get("logGroupNamePattern")
     if prefix is not None and pattern is not None:
@@ -80,7 +80,7 @@ def describe_log_groups(reconciler: Reconciler, actor: Actor, request: dict[str,
         return {"logGroups": []}
     identifiers = {_name(each) for each in request.get("logGroupIdentifiers") or ()}
     size = request.get("limit", 50)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         rows = {row.name: row for row in session.scalars(select(LogGroup))}
         rows.setdefault(LOG_GROUP, LogGroup(name=LOG_GROUP))
         names = sorted(
@@ -92,7 +92,9 @@ def describe_log_groups(reconciler: Reconciler, actor: Actor, request: dict[str,
             and (not identifiers or name in identifiers)
         )
         streams = {
-            name: newest_streams(session, actor, reconciler.store, (name,)) for name in names[:size] if pattern is None
+            name: newest_streams(session, actor, controller.access.store, (name,))
+            for name in names[:size]
+            if pattern is None
         }
         rows[LOG_GROUP].created_at = session.scalar(select(func.min(Job.created_at))) or 0
         session.expunge_all()
@@ -111,20 +113,20 @@ def _describe(group: LogGroup, streams: Sequence[Stream] | None) -> dict[str, An
     return described
 
 
-def list_tags_for_resource(reconciler: Reconciler, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
+def list_tags_for_resource(controller: Controller, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
     """ListTagsForResource: the tags of the group with this ARN."""
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         return {"tags": _group(session, actor, request["resourceArn"], Operation.LIST_TAGS_FOR_RESOURCE).tags}
 
 
 # -- what is written --------------------------------------------------------------------------------------------------
 
 
-def write(reconciler: Reconciler, actor: Actor, operation: str, request: dict[str, Any]) -> None:
+def write(controller: Controller, actor: Actor, operation: str, request: dict[str, Any]) -> None:
     """Carry out one of :data:`WRITES`. Raises LogsError, RequestError; DatabaseError where the database can't be written."""
-    reconciler.check_writable(adds=operation.startswith(("Create", "Put", "Tag")))
-    with reconciler.writing, reconciler.database.session() as session:
-        WRITES[operation](actor, (session, reconciler.store), request)
+    controller.writes.check(adds=operation.startswith(("Create", "Put", "Tag")))
+    with controller.writes.session() as session:
+        WRITES[operation](actor, (session, controller.access.store), request)
 
 
 _Place = tuple[Session, Store]

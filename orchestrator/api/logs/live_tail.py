@@ -17,9 +17,9 @@ from orchestrator.api.logs import eventstream
 from orchestrator.api.logs.events import Event, is_event, milliseconds
 from orchestrator.api.logs.filter import Matcher
 from orchestrator.api.logs.streams import Stream, newest_streams
+from orchestrator.control.controller import Controller
 from orchestrator.control.log_hub import Waker
 from orchestrator.control.log_tail import JobLogs
-from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.persistence.models import now
 from orchestrator.services.permissions import Actor
@@ -83,7 +83,7 @@ class LiveTail:
 
     def __init__(
         self,
-        reconciler: Reconciler,
+        controller: Controller,
         actor: Actor,
         groups: Collection[str],
         wanted: Callable[[str], bool],
@@ -92,17 +92,17 @@ class LiveTail:
         """Raises OSError.
 
         Args:
-            reconciler: Whose jobs' logs are followed.
+            controller: Whose jobs' logs are followed.
             actor: Who follows them.
             groups: Names of the log groups.
             wanted: Whether a stream is asked for, by its name.
             matches: Whether a line is asked for.
         """
-        self._reconciler, self._actor, self._groups = reconciler, actor, groups
+        self._controller, self._actor, self._groups = controller, actor, groups
         self._wanted, self._matches = wanted, matches
         self.group_of: dict[str, str] = {}
         """Group of each stream that was followed."""
-        self.calls, self.waker = reconciler.followed, Waker()
+        self.calls, self.waker = controller.access.followed, Waker()
         self._started = self._asked = now()
         self._next_refresh, self._is_asked = 0.0, threading.Event()
         self._jobs: dict[str, _Job] = {}
@@ -117,7 +117,7 @@ class LiveTail:
         """Follow the jobs; waits for nothing."""
         with self._lock:
             self._is_open = True
-            self._watching.enter_context(self._reconciler.logs.watch(self))
+            self._watching.enter_context(self._controller.logs.watch(self))
             for job in self._jobs.values():
                 self._attend(job)
         self._is_asked.set()  # nobody told of what has changed since the first look
@@ -169,9 +169,9 @@ class LiveTail:
         """Take up streams that began; those that ended before this call have their last look."""
         self._is_asked.clear()
         asked = now()
-        with self._reconciler.database.session() as session:
+        with self._controller.database.session() as session:
             since = max(self._started, self._asked - _OVERLAP)
-            streams = newest_streams(session, self._actor, self._reconciler.store, self._groups, since=since)
+            streams = newest_streams(session, self._actor, self._controller.access.store, self._groups, since=since)
         self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
         for stream in streams:
             if stream.run is not None and stream.name not in self._over and self._wanted(stream.name):
@@ -192,7 +192,7 @@ class LiveTail:
 
     def _attend(self, job: _Job) -> None:
         chosen = job.view.chosen
-        job.logs = job.following.enter_context(self._reconciler.logs.follow(chosen.run, chosen.job, self.waker))
+        job.logs = job.following.enter_context(self._controller.logs.follow(chosen.run, chosen.job, self.waker))
 
     def _leave(self, jobs: Iterable[str]) -> None:
         for name in jobs:

@@ -30,7 +30,7 @@ from orchestrator.api.logs.errors import JSON, LogsError, absent, invalid
 from orchestrator.api.logs.events import Event, event_id, first_and_last
 from orchestrator.api.logs.live_tail import LiveTail, messages
 from orchestrator.api.logs.streams import Stream, created_streams, find_stream, newest_streams
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.persistence.models import now
 from orchestrator.services.arns import here, log_group_arn
@@ -57,12 +57,12 @@ _LIST_TOKEN = re.compile(r"([0-9]{1,15})/(.+)")
 
 
 async def answer(
-    reconciler: Reconciler, actor: Actor, ending: threading.Event, target: str, body: Callable[[], Awaitable[Any]]
+    controller: Controller, actor: Actor, ending: threading.Event, target: str, body: Callable[[], Awaitable[Any]]
 ) -> Response:
     """Answer one request; a refusal is an answer, too.
 
     Args:
-        reconciler: Whose logs these are.
+        controller: Whose logs these are.
         actor: Who asks.
         ending: Set when the server ends, which ends the streams.
         target: The header ``X-Amz-Target``.
@@ -77,12 +77,12 @@ async def answer(
         actor.check(Operation(operation))
         request = validate(operation, await body())
         if operation == "StartLiveTail":
-            return await reconciler.calls.answer(partial(start_live_tail, reconciler, actor, ending, request))
+            return await controller.access.calls.answer(partial(start_live_tail, controller, actor, ending, request))
         if operation in groups.WRITES:
-            await run_in_threadpool(groups.write, reconciler, actor, operation, request)
+            await run_in_threadpool(groups.write, controller, actor, operation, request)
             return JSONResponse({}, media_type=JSON)
-        return await reconciler.calls.answer(
-            lambda: JSONResponse(OPERATIONS[operation](reconciler, actor, request), media_type=JSON)
+        return await controller.access.calls.answer(
+            lambda: JSONResponse(OPERATIONS[operation](controller, actor, request), media_type=JSON)
         )
     except LogsError as error:
         return error.response()
@@ -122,11 +122,11 @@ def validate(operation: str, request: object) -> dict[str, Any]:
 # -- operations -------------------------------------------------------------------------------------------------------
 
 
-def get_log_events(reconciler: Reconciler, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
+def get_log_events(controller: Controller, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
     """GetLogEvents: a page of one stream, from either end or from a token. Tokens are positions: they never expire."""
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         group = groups.named_by(session, request)
-        stream = _named(reconciler, actor, session, group, request["logStreamName"], Operation.GET_LOG_EVENTS)
+        stream = _named(controller, actor, session, group, request["logStreamName"], Operation.GET_LOG_EVENTS)
     view = stream.file.look()
     since, before = request.get("startTime", 0), request.get("endTime")
     limit = request.get("limit", _MOST_EVENTS)
@@ -150,7 +150,7 @@ def get_log_events(reconciler: Reconciler, actor: Actor, request: dict[str, Any]
     }
 
 
-def filter_log_events(reconciler: Reconciler, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
+def filter_log_events(controller: Controller, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
     """FilterLogEvents: the matching events of many streams, merged by time; the newest first with startFromHead false.
 
     A page ends after ``limit`` events, 1 MiB, or two seconds of search. Its token is the id of the last event that was looked at.
@@ -162,7 +162,7 @@ def filter_log_events(reconciler: Reconciler, actor: Actor, request: dict[str, A
         raise invalid("The specified nextToken is invalid.")
     ascending = token[1] == "f" if token else request.get("startFromHead", True)
     since, before = request.get("startTime", 0), request.get("endTime", 10**14) + 1  # inclusive here, as AWS has it
-    streams = _searched(reconciler, actor, request, since)
+    streams = _searched(controller, actor, request, since)
     if len(request.get("logStreamNames", ())) != 1 and any(stream.live for stream in streams):
         before = min(before, newest)
     reached = (int(token[2]), int(token[3]), int(token[4])) if token else None
@@ -197,7 +197,7 @@ def filter_log_events(reconciler: Reconciler, actor: Actor, request: dict[str, A
     return response
 
 
-def describe_log_streams(reconciler: Reconciler, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
+def describe_log_streams(controller: Controller, actor: Actor, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeLogStreams: by name or by the time of the last event, of the newest 1,000 streams that fit."""
     by_time = request.get("orderBy", "LogStreamName") == "LastEventTime"
     if request.get("orderBy", "LogStreamName") not in ("LogStreamName", "LastEventTime"):
@@ -208,9 +208,9 @@ def describe_log_streams(reconciler: Reconciler, actor: Actor, request: dict[str
     token = _LIST_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
     if given and not token:
         raise invalid("The specified nextToken is invalid.")
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         group = groups.named_by(session, request)
-        streams = newest_streams(session, actor, reconciler.store, (group,), prefix) + created_streams(
+        streams = newest_streams(session, actor, controller.access.store, (group,), prefix) + created_streams(
             session, group, prefix
         )
     times = {stream.name: first_and_last(stream.path) for stream in streams} if by_time else {}
@@ -228,7 +228,7 @@ def describe_log_streams(reconciler: Reconciler, actor: Actor, request: dict[str
     return response
 
 
-OPERATIONS: dict[str, Callable[[Reconciler, Actor, dict[str, Any]], dict[str, Any]]] = {
+OPERATIONS: dict[str, Callable[[Controller, Actor, dict[str, Any]], dict[str, Any]]] = {
     "GetLogEvents": get_log_events,
     "FilterLogEvents": filter_log_events,
     "DescribeLogStreams": describe_log_streams,
@@ -250,9 +250,9 @@ _INSTEAD = {
 """Substitutes for unsupported operations, by a part of their names."""
 
 
-def start_live_tail(reconciler: Reconciler, actor: Actor, ending: threading.Event, request: dict[str, Any]) -> Response:
+def start_live_tail(controller: Controller, actor: Actor, ending: threading.Event, request: dict[str, Any]) -> Response:
     """StartLiveTail: an event stream of the lines that are written from now on. Streams need not exist yet."""
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         tailed = [groups.existing(session, identifier) for identifier in request["logGroupIdentifiers"]]
     names, prefixes = request.get("logStreamNames"), request.get("logStreamNamePrefixes")
     if names and prefixes:
@@ -268,7 +268,7 @@ def start_live_tail(reconciler: Reconciler, actor: Actor, ending: threading.Even
     start = {"logGroupIdentifiers": [log_group_arn(name) for name in tailed]}
     start |= {"logEventFilterPattern": request.get("logEventFilterPattern", "")}
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
-    tail = LiveTail(reconciler, actor, tailed, asked_for, matches)
+    tail = LiveTail(controller, actor, tailed, asked_for, matches)
     return _Session(tail, messages(tail, start, here().id, ending))
 
 
@@ -290,23 +290,23 @@ class _Session(Following):
 # -- parts ------------------------------------------------------------------------------------------------------------
 
 
-def _named(reconciler: Reconciler, actor: Actor, session: Any, group: str, name: str, operation: Operation) -> Stream:
-    stream = find_stream(session, actor, reconciler.store, group, name, operation)
+def _named(controller: Controller, actor: Actor, session: Any, group: str, name: str, operation: Operation) -> Stream:
+    stream = find_stream(session, actor, controller.access.store, group, name, operation)
     if stream is None:
         raise absent("log stream", name)
     return stream
 
 
-def _searched(reconciler: Reconciler, actor: Actor, request: dict[str, Any], since: int) -> list[Stream]:
+def _searched(controller: Controller, actor: Actor, request: dict[str, Any], since: int) -> list[Stream]:
     """The streams that a search is about; those named must exist."""
     names, prefix = request.get("logStreamNames"), request.get("logStreamNamePrefix")
     if names and prefix:
         raise invalid("Only one of logStreamNames and logStreamNamePrefix can be used.")
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         group, operation = groups.named_by(session, request), Operation.FILTER_LOG_EVENTS
         if names:
-            return [_named(reconciler, actor, session, group, name, operation) for name in dict.fromkeys(names)]
-        return newest_streams(session, actor, reconciler.store, (group,), prefix or "", since - _LATE)
+            return [_named(controller, actor, session, group, name, operation) for name in dict.fromkeys(names)]
+        return newest_streams(session, actor, controller.access.store, (group,), prefix or "", since - _LATE)
 
 
 def _pattern(text: str) -> log_filter.Matcher:

@@ -14,8 +14,8 @@ from fastapi import APIRouter, Query, Request
 from sqlalchemy import ColumnElement, case, func, select
 from sqlalchemy.orm import Session, selectinload
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.api.http.requests import actor_of, controller_of
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import RunFacts, facts_of
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.errors import RequestError
@@ -88,18 +88,18 @@ def find_jobs(
 
     ``next`` and ``previous`` are the places of the pages beside this one; null where there is none.
     """
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     if queue:
-        with reconciler.database.session() as session:
+        with controller.database.session() as session:
             if queue not in (known := queue_names(session, actor)):
                 raise UnknownQueue(queue, known, 404)
     return page_of_jobs(
-        reconciler, actor, Wanted(tuple(status), queue, search), most, after, before, with_progress=progress
+        controller, actor, Wanted(tuple(status), queue, search), most, after, before, with_progress=progress
     )
 
 
 def page_of_jobs(
-    reconciler: Reconciler,
+    controller: Controller,
     actor: Actor,
     wanted: Wanted,
     most: int = JOBS_A_PAGE,
@@ -118,15 +118,15 @@ def page_of_jobs(
         raise RequestError("a page is after a place or before one, not both; leave one of them out")
     places = {"after": Cursor.read(after) if after else None, "before": Cursor.read(before) if before else None}
     queues = wanted.queues(actor)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         if conditions := wanted.conditions(session):
             counts = count(session, queues, conditions, MOST_COUNTED)
         else:
-            counts = reconciler.database.counts.by_status(queues)
+            counts = controller.database.counts.by_status(queues)
         page = read_page(session, most, queues, wanted.statuses, conditions, **places)
-        rows = [_row(reconciler, session, job) for job in page.jobs]
+        rows = [_row(controller, session, job) for job in page.jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
-    progress = _progress(reconciler, actor, trainings)
+    progress = _progress(controller, actor, trainings)
     states = wanted.statuses or tuple(Status)
     return {
         "jobs": [{**row, "progress": progress.get(row["id"])} for row, _ in rows],
@@ -157,7 +157,7 @@ def ran(time: RunTime | None) -> dict[str, Any]:
     return {"ranSeconds": time and time.seconds, "runsSince": time and time.since}
 
 
-def children_of(reconciler: Reconciler, session: Session, array: Job) -> list[dict[str, Any]]:
+def children_of(controller: Controller, session: Session, array: Job) -> list[dict[str, Any]]:
     """The children of an array: those that failed first, then those that run, wait and succeeded; at most 100."""
     order = case({str(status): place for place, status in enumerate(_FAILED_FIRST)}, value=Job.status)
     query = select(Job).where(Job.parent == array.id).order_by(order, Job.array_index).limit(_CHILDREN)
@@ -166,22 +166,22 @@ def children_of(reconciler: Reconciler, session: Session, array: Job) -> list[di
             "index": child.array_index,
             "id": child.id,
             "status": child.status,
-            "statusReason": reconciler.admission.reason(child).words or None,
+            "statusReason": controller.admission.reason(child).words or None,
             **ran(child.run_time),
         }
         for child in session.scalars(query.options(selectinload(Job.attempts)))
     ]
 
 
-def reason_of(reconciler: Reconciler, session: Session, job: Job) -> Reason:
+def reason_of(controller: Controller, session: Session, job: Job) -> Reason:
     """Why a job is in its state. For an array with waiting children: how many wait, and why the first one does."""
-    own = reconciler.admission.reason(job)
+    own = controller.admission.reason(job)
     if job.kind != "array" or own.words != array_of(job.array_size):
         return own
     waiting = select(func.count(), func.min(Job.array_index)).where(Job.parent == job.id, Job.status.in_(EARLY))
     count, first = session.execute(waiting).one()
     child = session.get(Job, f"{job.id}:{first}") if count else None
-    words = reconciler.admission.reason(child).words if child else ""
+    words = controller.admission.reason(child).words if child else ""
     if words in ("", WAITING):
         return Reason(words or own.words, own.aws)
     return Reason(f"{count} of {job.array_size} wait; child {first}: {words}", own.aws)
@@ -196,12 +196,12 @@ class _Training:
     iterations: int
 
 
-def _row(reconciler: Reconciler, session: Session, job: Job) -> tuple[dict[str, Any], _Training | None]:
+def _row(controller: Controller, session: Session, job: Job) -> tuple[dict[str, Any], _Training | None]:
     row = {
         "id": job.id,
         "name": job.name,
         "status": job.status,
-        "statusReason": reason_of(reconciler, session, job).words or None,
+        "statusReason": reason_of(controller, session, job).words or None,
         "queue": job.queue,
         "owner": job.owner,
         "run": job.run,
@@ -226,23 +226,23 @@ def _row(reconciler: Reconciler, session: Session, job: Job) -> tuple[dict[str, 
     return {**row, "kind": kind_of(spec), "nodes": len(gang.nodes)}, found
 
 
-def _progress(reconciler: Reconciler, actor: Actor, trainings: Sequence[_Training]) -> Mapping[str, dict[str, Any]]:
+def _progress(controller: Controller, actor: Actor, trainings: Sequence[_Training]) -> Mapping[str, dict[str, Any]]:
     """By job the progress of those trainings whose runs the caller may see; empty where the store does not answer."""
     if not trainings:
         return {}
     try:
-        read, runs = reconciler.calls.call(partial(_read, actor, reconciler.store, trainings))
+        read, runs = controller.access.calls.call(partial(_read, actor, controller.access.store, trainings))
     except (StoreSilent, OSError):
         return {}
     hidden = set[str]()
     if actor.queues is not None:  # a job may continue a run of another queue
-        with reconciler.database.session() as session:
+        with controller.database.session() as session:
             # one query instead of many
             _known = session.scalars(select(RunRecord).where(RunRecord.name.in_(list(runs)))).all()
             owners = {name: owner_of(session, run) for name, run in runs.items()}
         hidden = {name for name, owner in owners.items() if owner is None or not actor.may_see(owner)}
     shown = [each for each in trainings if each.job.run not in hidden]
-    known = {each.job.id: _told(reconciler, each, read[each.job.id]) for each in shown}
+    known = {each.job.id: _told(controller, each, read[each.job.id]) for each in shown}
     return {job: progress for job, progress in known.items() if progress is not None}
 
 
@@ -255,10 +255,10 @@ def _read(
     return read, {name: facts_of(store.run(name)) for name in names}
 
 
-def _told(reconciler: Reconciler, training: _Training, curve: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _told(controller: Controller, training: _Training, curve: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Progress of a training: the last report of its main node, and its curve; None before its first iteration."""
     job = training.job
-    live = reconciler.bus.progress(job.id, job.attempts[-1].number, training.main) or {}
+    live = controller.bus.progress(job.id, job.attempts[-1].number, training.main) or {}
     last = curve[-1] if curve else {}
     iteration = int(max(finite(live.get("iteration")) or 0, finite(last.get("iteration")) or 0))
     if not iteration:

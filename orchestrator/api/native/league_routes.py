@@ -13,9 +13,9 @@ from fastapi import APIRouter, Header, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.api.http.callers import user_name
-from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
+from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
@@ -103,7 +103,7 @@ class DisqualifyRequest(_Strict):
 @router.get("/leagues")
 def list_leagues(request: Request) -> list[dict[str, Any]]:
     """All leagues by name, with their rules; an altered one has a ``problem``."""
-    store = reconciler_of(request).store
+    store = controller_of(request).access.store
     try:
         return [_described(leagues.find(store, name)) for name in leagues.names(store)]
     except LeagueError as error:
@@ -113,9 +113,9 @@ def list_leagues(request: Request) -> list[dict[str, Any]]:
 @router.post("/leagues")
 def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
     """Create a league; its rules are never changed."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     actor.check(Operation.CREATE_LEAGUE)
-    reconciler.check_writable(adds=True)
+    controller.writes.check(adds=True)
     if body.opens is not None and body.closes is not None and body.opens >= body.closes:
         raise ClientError("opens: the league would close before it opens")
     if body.closes is not None and body.closes <= time.time():
@@ -125,7 +125,7 @@ def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
     given = body.model_dump()
     rules = Rules(**{key: given[key] for key in asdict(Rules())})
     try:
-        digests = {name: leagues.digest_of_track(reconciler.store, name) for name in body.track}
+        digests = {name: leagues.digest_of_track(controller.access.store, name) for name in body.track}
         league = League(
             name=body.name,
             track=tuple(body.track),
@@ -138,7 +138,7 @@ def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
             most_entries=body.most_entries,
             track_digests={name: digest for name, digest in digests.items() if digest is not None},
         )
-        return _described(leagues.create(reconciler.store, league))
+        return _described(leagues.create(controller.access.store, league))
     except LeagueError as error:
         raise ClientError(str(error)) from None
     except OSError as error:
@@ -148,7 +148,7 @@ def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
 @router.get("/leagues/{name}")
 def read_league(request: Request, name: str) -> dict[str, Any]:
     """The rules of a league, and how many entries it has."""
-    return _described(_find(reconciler_of(request), name)[0])
+    return _described(_find(controller_of(request), name)[0])
 
 
 @router.get("/leagues/{name}/entries")
@@ -156,7 +156,7 @@ def league_table(
     request: Request, name: str, every: bool = Query(default=False, description="all entries of each racer")
 ) -> list[dict[str, Any]]:
     """The table, the first one ahead: of each racer the best entry, then those that are not ranked and why."""
-    stored, league = _find(reconciler_of(request), name)
+    stored, league = _find(controller_of(request), name)
     try:
         return [row.document() for row in table(stored.contenders(), league.rules.ranking, every=every)]
     except LeagueError as error:
@@ -166,12 +166,12 @@ def league_table(
 @router.get("/leagues/{name}/entries/{number}")
 def read_entry(request: Request, name: str, number: int) -> Any:
     """An entry with its race and, where it is disqualified, the ruling; ``problem`` tells what was altered in it or in its model."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    stored, _ = _find(reconciler, name)
+    controller, actor = controller_of(request), actor_of(request)
+    stored, _ = _find(controller, name)
     found: dict[str, Any] = {"entry": number}
     try:
         found = stored.entry(number)
-        model = entered_model(reconciler, found)
+        model = entered_model(controller, found)
         _verify(model)
         _check_digest(model, found)
     except UnknownLeague as error:
@@ -191,9 +191,9 @@ def race(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit the evaluation of a model by the league's rules; a second call with the same idempotency key gets the answer of the first one."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    stored, league = _find(reconciler, name)
-    model = find_model(reconciler, actor, body.model, body.version)
+    controller, actor = controller_of(request), actor_of(request)
+    stored, league = _find(controller, name)
+    model = find_model(controller, actor, body.model, body.version)
     actor.check(Operation.RACE, owner_of_model(model))
     try:
         if closed := league.closed(time.time()):
@@ -201,7 +201,7 @@ def race(
         stored.admit(_caller(actor), _racer(actor, body))
     except LeagueError as error:
         raise _refused(error) from None
-    return _submit(reconciler, actor, league, model, body.directory, idempotency_key)
+    return _submit(controller, actor, league, model, body.directory, idempotency_key)
 
 
 @router.post("/leagues/{name}/entries/{number}/races")
@@ -213,31 +213,31 @@ def rerun(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit the race of an entry once more, whether the league is open or not; on a CPU its laps are the same."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    stored, league = _find(reconciler, name)
+    controller, actor = controller_of(request), actor_of(request)
+    stored, league = _find(controller, name)
     try:
         entry = stored.entry(number)
     except LeagueError as error:
         raise _refused(error) from None
-    model = entered_model(reconciler, entry)
+    model = entered_model(controller, entry)
     actor.check(Operation.RERUN_ENTRY, owner_of_model(model))
     _check_digest(model, entry)
-    return _submit(reconciler, actor, league, model, body.directory, idempotency_key)
+    return _submit(controller, actor, league, model, body.directory, idempotency_key)
 
 
 @router.post("/leagues/{name}/entries")
 def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
     """Make an entry of a race that has ended: the model's digest, the evaluation and its laps, for good."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    stored, league = _find(reconciler, name)
-    model = find_model(reconciler, actor, body.model, body.version)
+    controller, actor = controller_of(request), actor_of(request)
+    stored, league = _find(controller, name)
+    model = find_model(controller, actor, body.model, body.version)
     actor.check(Operation.ENTER_LEAGUE, owner_of_model(model))
-    reconciler.check_writable(adds=True)
-    checkpoint = _checked(reconciler, league, model)
-    job, run = _race_of(reconciler, actor, league, body.job)
+    controller.writes.check(adds=True)
+    checkpoint = _checked(controller, league, model)
+    job, run = _race_of(controller, actor, league, body.job)
     cited = model.facts()["run"]
-    with using(reconciler, cited, run):
-        summary = _summary(reconciler, league, model, checkpoint, job)
+    with using(controller, cited, run):
+        summary = _summary(controller, league, model, checkpoint, job)
         entry = {
             "racer": _racer(actor, body),
             "owner": _caller(actor),
@@ -257,10 +257,10 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
 @router.post("/leagues/{name}/entries/{number}/disqualify")
 def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest) -> dict[str, Any]:
     """Disqualify an entry for good, with the reason; the entry itself stays as it is. For the league's owner."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    stored, league = _find(reconciler, name)
+    controller, actor = controller_of(request), actor_of(request)
+    stored, league = _find(controller, name)
     actor.check(Operation.DISQUALIFY, LeagueOf(league.name, league.owner))
-    reconciler.check_writable(adds=True)
+    controller.writes.check(adds=True)
     try:
         stored.disqualify(number, body.reason, _caller(actor))
     except LeagueError as error:
@@ -272,7 +272,7 @@ def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest
 
 def entered_jobs(request: Request, name: str) -> set[str]:
     """The jobs whose races are entries of a league, without those of altered entries."""
-    stored, _ = _find(reconciler_of(request), name)
+    stored, _ = _find(controller_of(request), name)
     found = set()
     for number in stored.numbers():
         with contextlib.suppress(LeagueError):
@@ -280,10 +280,10 @@ def entered_jobs(request: Request, name: str) -> set[str]:
     return found
 
 
-def _find(reconciler: Reconciler, name: str) -> tuple[StoredLeague, League]:
+def _find(controller: Controller, name: str) -> tuple[StoredLeague, League]:
     """Raises ClientError where the league does not exist, or its rules were altered."""
     try:
-        stored = leagues.find(reconciler.store, name)
+        stored = leagues.find(controller.access.store, name)
         return stored, stored.definition()
     except LeagueError as error:
         raise _refused(error) from None
@@ -325,17 +325,17 @@ def _suffix(actor: Actor) -> str:
 
 
 def _submit(
-    reconciler: Reconciler, actor: Actor, league: League, model: Model, directory: str, idempotency_key: str | None
+    controller: Controller, actor: Actor, league: League, model: Model, directory: str, idempotency_key: str | None
 ) -> dict[str, Any]:
     """Submit the race of a model. Raises ClientError."""
-    _checked(reconciler, league, model)
+    _checked(controller, league, model)
     facts = model.facts()
-    reconciler.check_writable(adds=True)
-    reconciler.engine.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    controller.writes.check(adds=True)
+    controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
 
     def call(known: Known) -> dict[str, Any]:
-        with reconciler.writing, reconciler.database.session() as session:
-            context = Context(session, reconciler, actor, idempotency_key, known=known)
+        with controller.writes.session() as session:
+            context = Context(session, controller, actor, idempotency_key, known=known)
             earlier = submission.answered(context)
             if earlier is not None:
                 return submission.answer(earlier)
@@ -348,17 +348,17 @@ def _submit(
             what = f"league {league.name}, race of {model.reference}"
             return submission.answer(submit(context, spec, directory, what, tags=tags))
 
-    answer = with_store(reconciler, call)
-    reconciler.wake()
+    answer = with_store(controller, call)
+    controller.alarm.ring()
     return {**answer, "model": model.name, "version": model.version, "run": facts["run"]}
 
 
-def _checked(reconciler: Reconciler, league: League, model: Model) -> Checkpoint:
+def _checked(controller: Controller, league: League, model: Model) -> Checkpoint:
     """The checkpoint that a sound model was made of, which a race loads. Raises ClientError."""
     _verify(model)
     facts = model.facts()
     try:
-        league.check_tracks(reconciler.store)
+        league.check_tracks(controller.access.store)
     except LeagueError as error:
         raise _refused(error) from None
     kind = task_config(str(facts.get("task")))
@@ -366,7 +366,7 @@ def _checked(reconciler: Reconciler, league: League, model: Model) -> Checkpoint
         raise ClientError(
             f"model {model.reference} is of task {facts.get('task')}; a league takes models of the racer's installed tasks"
         )
-    name, run = str(facts.get("checkpoint")), reconciler.store.run(str(facts.get("run")))
+    name, run = str(facts.get("checkpoint")), controller.access.store.run(str(facts.get("run")))
     found = checkpoint_called(run.checkpoints, name)
     gone = ClientError(
         f"model {model.reference}: checkpoint {name} of run {run.name}, which a race loads, is gone; register one that is there",
@@ -387,9 +387,9 @@ def _identity(model: Model) -> dict[str, Any]:
     return {"name": model.name, "version": model.version, "digest": _digest(model)}
 
 
-def _race_of(reconciler: Reconciler, actor: Actor, league: League, reference: str) -> tuple[str, str]:
+def _race_of(controller: Controller, actor: Actor, league: League, reference: str) -> tuple[str, str]:
     """Id and run of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         queues = actor.queues
         job = find_job(session, reference, queues)
         if job is None:
@@ -404,9 +404,9 @@ def _race_of(reconciler: Reconciler, actor: Actor, league: League, reference: st
         return job.id, job.run
 
 
-def _summary(reconciler: Reconciler, league: League, model: Model, checkpoint: Checkpoint, job: str) -> dict[str, Any]:
+def _summary(controller: Controller, league: League, model: Model, checkpoint: Checkpoint, job: str) -> dict[str, Any]:
     """The evaluation that a job made of the model's checkpoint, which is a race of this league. Raises ClientError."""
-    run = reconciler.store.run(model.facts()["run"])
+    run = controller.access.store.run(model.facts()["run"])
     found = next((each for each in list_evaluations(run) if each.get("job") == job), None)
     if found is None:
         raise ClientError(

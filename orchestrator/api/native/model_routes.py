@@ -7,7 +7,7 @@ from typing import Any, Literal
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.services.models import described, find_model, owner_of_model, register
 from orchestrator.services.permissions import Operation
@@ -31,7 +31,7 @@ class RegisterRequest(BaseModel):
 def list_models(request: Request) -> Any:
     """The newest version of each model that the caller may see, by name."""
     actor = actor_of(request)
-    store = reconciler_of(request).store
+    store = controller_of(request).access.store
     newest = [models.versions(store, name)[-1] for name in models.model_names(store)]
     return actor.shown([described(model) for model in newest if actor.may_see(owner_of_model(model))])
 
@@ -44,8 +44,8 @@ def read_model(
     verify: bool = Query(default=False, description="read every file and check its digest"),
 ) -> Any:
     """A version of a model, with its policy contract, the SHA-256 of its weights and the numbers of all its versions; with ``verify``, ``problem`` names the damaged files."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    model = find_model(reconciler, actor, name, version)
+    controller, actor = controller_of(request), actor_of(request)
+    model = find_model(controller, actor, name, version)
     actor.check(Operation.READ_MODEL, owner_of_model(model))
     found = described(model, verify)
     try:
@@ -53,12 +53,12 @@ def read_model(
         found["weights"] = bundles.read_manifest(model.bundle)["files"].get(bundles.POLICY, {}).get("sha256")
     except DamagedBundle as error:
         found["problem"] = found.get("problem") or str(error)
-    return actor.shown({**found, "versions": [each.version for each in models.versions(reconciler.store, name)]})
+    return actor.shown({**found, "versions": [each.version for each in models.versions(controller.access.store, name)]})
 
 
 @router.post("/runs/{name}/models")
 def register_model(request: Request, name: str, body: RegisterRequest) -> Any:
     """Keep the exported bundle of a checkpoint as the next version of a model, permanently."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    model = register(reconciler, actor, name, body.name, body.checkpoint, again=body.again)
+    controller, actor = controller_of(request), actor_of(request)
+    model = register(controller, actor, name, body.name, body.checkpoint, again=body.again)
     return actor.shown(described(model))

@@ -10,10 +10,10 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api.batch import rules
 from orchestrator.api.batch.operations import validate
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.control.compute_environments import options_of
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.snapshot import new_nodes
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec
@@ -45,18 +45,18 @@ class PlanRequest(BaseModel):
 @router.post("/plan")
 def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """The processes that a job would start, and their hosts, if all hosts were free. Nothing is registered and nothing starts."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     wanted, definition = _gang_of(body), body.definition
-    check_tracks(reconciler.store, wanted.spec)
+    check_tracks(controller.access.store, wanted.spec)
     for source in sources_of(wanted):
-        run = permitted_run(reconciler, actor, source.run, Operation.READ_RUN)
+        run = permitted_run(controller, actor, source.run, Operation.READ_RUN)
         if source.key in ("evaluate", "race"):
-            check_evaluation(reconciler.store, run, wanted.spec or {}, source.key)
-    reconciler.engine.capacity(patience=FRESH)  # before the transaction, which must not wait for an engine
-    with reconciler.database.session() as session:
+            check_evaluation(controller.access.store, run, wanted.spec or {}, source.key)
+    controller.engines.capacity(patience=FRESH)  # before the transaction, which must not wait for an engine
+    with controller.database.session() as session:
         queue = named_queue(session, actor, body.queue)
         actor.check(Operation.PLAN, JobsOf(queue.name))
-        found = fit_of(session, actor, reconciler, queue, wanted)
+        found = fit_of(session, actor, controller, queue, wanted)
         if found.allocation is None:
             raise ClientError(
                 found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
@@ -73,8 +73,8 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
         )
         attempt = Attempt(number=1, epoch=1, compute_environment=compute_environment, nodes=new_nodes(placements))
         options = options_of(session.get(ComputeEnvironment, compute_environment), queue)
-        gang = reconciler.attempts.gang(job, attempt, wanted, options)  # neither of the two is stored
-    planned = _planned(reconciler, replace(gang, bus_token="…") if gang.bus_token else gang)
+        gang = controller.attempts.gang(job, attempt, wanted, options)  # neither of the two is stored
+    planned = _planned(controller, replace(gang, bus_token="…") if gang.bus_token else gang)
     nodes = [
         {
             "index": node.contract.node_index,
@@ -94,7 +94,7 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             "plan the job with fewer nodes"
         )
     name = engine_of(placements[0].host)
-    images = reconciler.engine.engines[name].traits.images
+    images = controller.engines.engines[name].traits.images
     return {
         "engine": name,
         "computeEnvironment": compute_environment,
@@ -107,14 +107,14 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
 @router.post("/fit")
 def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     wanted = _gang_of(body)
-    check_tracks(reconciler.store, wanted.spec)
-    reconciler.engine.capacity(patience=FRESH)
-    with reconciler.database.session() as session:
+    check_tracks(controller.access.store, wanted.spec)
+    controller.engines.capacity(patience=FRESH)
+    with controller.database.session() as session:
         queue = named_queue(session, actor, body.queue)
         actor.check(Operation.FIT, JobsOf(queue.name))
-        return {"problem": fit_of(session, actor, reconciler, queue, wanted).problem}
+        return {"problem": fit_of(session, actor, controller, queue, wanted).problem}
 
 
 def _gang_of(body: PlanRequest) -> GangSpec:
@@ -125,8 +125,8 @@ def _gang_of(body: PlanRequest) -> GangSpec:
     return rules.check_nodes(rules.node_properties(definition), "multinode")
 
 
-def _planned(reconciler: Reconciler, gang: Gang) -> Plan[Any]:
+def _planned(controller: Controller, gang: Gang) -> Plan[Any]:
     try:
-        return reconciler.engine.plan(gang)
+        return controller.engines.plan(gang)
     except EngineError as error:
         raise ClientError(str(error)) from None

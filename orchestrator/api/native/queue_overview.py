@@ -11,9 +11,9 @@ from fastapi import APIRouter, Query, Request
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.control.compute_environments import own_queues
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.snapshot import open_attempts, read_compute_environment, read_queue
 from orchestrator.control.usage import held_by, placements_of, usage_at
 from orchestrator.domain.hosts import Capacity, Queued, engine_of
@@ -46,14 +46,14 @@ def queues(
     How full a host is counts the jobs of all queues.
     """
     actor = actor_of(request)
-    return overview(reconciler_of(request), actor, queue)
+    return overview(controller_of(request), actor, queue)
 
 
-def overview(reconciler: Reconciler, actor: Actor, only: str = "") -> dict[str, Any]:
+def overview(controller: Controller, actor: Actor, only: str = "") -> dict[str, Any]:
     """``queues``, ``computeEnvironments``, ``engines`` and ``hosts``; ``only``: name of the one queue that is wanted. Raises UnknownQueue."""
-    engine = reconciler.engine
+    engine = controller.engines
     capacities = engine.capacity()
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         policies = {policy.name: policy for policy in session.scalars(select(SchedulingPolicy))}
         rows = [
             row for row in session.scalars(select(JobQueue).order_by(JobQueue.name)) if actor.may_see(JobsOf(row.name))
@@ -63,10 +63,10 @@ def overview(reconciler: Reconciler, actor: Actor, only: str = "") -> dict[str, 
             raise UnknownQueue(only, names, 404)
         rows = sorted((row for row in rows if only in ("", row.name)), key=lambda row: -row.priority)
         read = {row.name: read_queue(row, policies) for row in rows}
-        held = open_attempts(session, reconciler.work_queue.active())
+        held = open_attempts(session, controller.work_queue.active())
         decays = {name: queue.policy.decay_seconds for name, queue in read.items() if queue.policy}
-        used = usage_at(session, reconciler.clock.now(), decays, held)
-        counts = _counts(reconciler.database.counts)
+        used = usage_at(session, controller.clock.now(), decays, held)
+        counts = _counts(controller.database.counts)
         found = [
             {
                 "name": row.name,
@@ -77,7 +77,7 @@ def overview(reconciler: Reconciler, actor: Actor, only: str = "") -> dict[str, 
                 "counts": counts.get(row.name, {}),
                 "inUse": _amounts(attempt for job, attempt in held if job.queue == row.name),
                 "shares": _shares(read[row.name], used, held),
-                "front": _front(reconciler, session, row.name, MOST if only else FIRST),
+                "front": _front(controller, session, row.name, MOST if only else FIRST),
             }
             for row in rows
         ]
@@ -88,7 +88,7 @@ def overview(reconciler: Reconciler, actor: Actor, only: str = "") -> dict[str, 
     return {
         "queues": found,
         "computeEnvironments": compute_environments,
-        "engines": _engines(reconciler, capacities),
+        "engines": _engines(controller, capacities),
         "hosts": [
             {
                 **{key: value for key, value in asdict(host).items() if key in ("name", "cpus", "memory", "away")},
@@ -111,9 +111,9 @@ def _counts(counts: JobCounts) -> dict[str, dict[str, int]]:
     return found
 
 
-def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> list[dict[str, Any]]:
+def _front(controller: Controller, session: Session, queue: str, most: int) -> list[dict[str, Any]]:
     """The jobs of a queue that start next, in their order, with why each waits and since when [Unix ms]."""
-    order, times = reconciler.admission.front(queue, most)
+    order, times = controller.admission.front(queue, most)
     jobs = {job.id: job for job in session.scalars(select(Job).where(Job.id.in_(order)))}
     waiting = [jobs[each] for each in order if each in jobs and jobs[each].status == Status.RUNNABLE]
     return [
@@ -122,7 +122,7 @@ def _front(reconciler: Reconciler, session: Session, queue: str, most: int) -> l
             "name": job.name,
             "owner": job.owner,
             "share": job.share,
-            "reason": reconciler.admission.reason(job).words,
+            "reason": controller.admission.reason(job).words,
             "since": times.get(job.id),
         }
         for job in waiting
@@ -170,8 +170,8 @@ def _compute_environment(row: ComputeEnvironment, first: str) -> dict[str, Any]:
     return {"name": read.name, "engine": read.engine, "state": row.state, "hosts": read.hosts, "cpus": read.max_cpus}
 
 
-def _engines(reconciler: Reconciler, capacities: Mapping[str, Capacity]) -> list[dict[str, Any]]:
-    engine = reconciler.engine
+def _engines(controller: Controller, capacities: Mapping[str, Capacity]) -> list[dict[str, Any]]:
+    engine = controller.engines
     own = own_queues(engine.names)
     return [
         {

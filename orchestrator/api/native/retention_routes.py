@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.http.store_route import WorkRoute
 from orchestrator.services import retention
 
@@ -37,13 +37,13 @@ def read_garbage(
 
     ``next`` is None after the last part.
     """
-    return retention.next_part(reconciler_of(request), actor_of(request), after, older_than, take=False)
+    return retention.next_part(controller_of(request), actor_of(request), after, older_than, take=False)
 
 
 @router.post("/gc")
 def take_garbage(request: Request, body: TakeRequest) -> dict[str, Any]:
     """Take it: rows of jobs, their logs and outcomes, and runs that hold nothing else."""
-    return retention.next_part(reconciler_of(request), actor_of(request), body.after, body.older_than, take=True)
+    return retention.next_part(controller_of(request), actor_of(request), body.after, body.older_than, take=True)
 
 
 class ArchiveRequest(BaseModel):
@@ -55,11 +55,11 @@ class ArchiveRequest(BaseModel):
 @router.post("/runs/{name}/archive")
 def archive_run(request: Request, name: str, body: ArchiveRequest) -> dict[str, Any]:
     """Archive a run, so that nothing is added to it, it is left out of lists, and it is neither taken nor deleted; or take it out again."""
-    retention.archive(reconciler_of(request), actor_of(request), name, archived=body.archived)
+    retention.archive(controller_of(request), actor_of(request), name, archived=body.archived)
     return {"run": name, "archived": body.archived}
 
 
 @router.delete("/runs/{name}")
 def delete_run(request: Request, name: str) -> dict[str, Any]:
     """Delete a run with all that it holds, where nothing needs it. Answers its size; ``left`` is where in the trash the rest is that can't be removed."""
-    return retention.delete(reconciler_of(request), actor_of(request), name)
+    return retention.delete(controller_of(request), actor_of(request), name)

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.api.batch.fargate import without_effect
 from orchestrator.api.http.following import PIECE, Following
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import (
     job_list,
     key_routes,
@@ -32,7 +32,7 @@ from orchestrator.api.native import (
 from orchestrator.api.native.log_stream import followed, positions_of, stored
 from orchestrator.control.bus import BusError
 from orchestrator.control.compute_environments import own_queues, queue_engines
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.errors import ClientError
@@ -97,19 +97,19 @@ def capacity(request: Request, queue: str | None = None) -> dict[str, Any]:
     hosts tell that.
     ``queues``: those whose jobs the caller may see.
     """
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    names = reconciler.engine.names
-    with reconciler.database.session() as session:
+    controller, actor = controller_of(request), actor_of(request)
+    names = controller.engines.names
+    with controller.database.session() as session:
         if queue is not None:
             names = queue_engines(session, queue, names[0])
         queues = queue_names(session, actor)
-    capacities = reconciler.engine.capacity(names, FRESH)
+    capacities = controller.engines.capacity(names, FRESH)
     return {
-        "engines": own_queues(reconciler.engine.names),
+        "engines": own_queues(controller.engines.names),
         "hosts": [asdict(host) for capacity in capacities.values() for host in capacity.machines],
         "queued": {name: _limit(each) for name, each in capacities.items() if isinstance(each, Queued)},
-        "elastic": reconciler.engine.is_elastic(names),
-        "store": str(reconciler.store.path),
+        "elastic": controller.engines.is_elastic(names),
+        "store": str(controller.access.store.path),
         "queues": queues,
     }
 
@@ -133,30 +133,30 @@ def job_detail(
     ``runIsReplaced``: another run has its name now.
     ``withoutEffect``: members of its definition for Fargate, which change nothing here.
     """
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    with reconciler.database.session() as session:
+    controller, actor = controller_of(request), actor_of(request)
+    with controller.database.session() as session:
         job = permitted_job(session, actor, reference, Operation.READ_JOB)
-        run = reconciler.store.run(job.run)
+        run = controller.access.store.run(job.run)
     problem, is_replaced, is_gone, results, progress = None, False, False, None, None
     try:
-        found = reconciler.calls.call(partial(facts_of, run)) if store else None
+        found = controller.access.calls.call(partial(facts_of, run)) if store else None
         if found is not None:
-            with reconciler.database.session() as session:
+            with controller.database.session() as session:
                 owner = owner_of(session, found)
             is_replaced = is_of_earlier_run(job, found)
             is_gone = found.missing and job.first_epoch is not None and job.stopped_at is not None
             # a job may continue a run of another queue
             if owner is not None and actor.may_see(owner) and not is_replaced:
-                results, progress = reconciler.calls.call(partial(_results, run))
+                results, progress = controller.access.calls.call(partial(_results, run))
     except (StoreSilent, OSError) as error:
         problem = str(error)
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         job = permitted_job(session, actor, job.id, Operation.READ_JOB)
         described = runs.described(session, actor, results) if results else None
         definition = named_definition(session, job.definition)
         with reading(job):
-            attempts = [_attempt(reconciler, job, attempt.number) for attempt in job.attempts]
-            gang, reason = job.gang, job_list.reason_of(reconciler, session, job)
+            attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
+            gang, reason = job.gang, job_list.reason_of(controller, session, job)
             detail = {
                 "id": job.id,
                 "name": job.name,
@@ -175,7 +175,7 @@ def job_detail(
                 "stoppedAt": job.stopped_at,
                 **job_list.ran(job.run_time),
                 "phase": _phase(attempts, gang.main) if job.status == Status.RUNNING else None,
-                "children": job_list.children_of(reconciler, session, job) if job.kind == "array" else None,
+                "children": job_list.children_of(controller, session, job) if job.kind == "array" else None,
                 "nodes": len(gang.nodes),
                 "attempts": attempts,
                 "attemptsAllowed": job.attempts_allowed,
@@ -219,8 +219,8 @@ def job_logs(
 
     ``positions``: a JSON object of ``attempt/node`` and the ``position`` of its last line that the caller has.
     """
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    with reconciler.database.session() as session:
+    controller, actor = controller_of(request), actor_of(request)
+    with controller.database.session() as session:
         job = permitted_job(session, actor, reference, Operation.READ_JOB_LOGS)
         with reading(job):
             count = len(job.gang.nodes)
@@ -228,31 +228,31 @@ def job_logs(
             raise ClientError(
                 f"job {named(job.name, job.id)} has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
             )
-        chosen = Chosen(reconciler.store.run(job.run), job.id, node, rank, attempt)
-    view, calls = LogView(chosen, positions_of(positions), PIECE), reconciler.followed
-    lines = followed(view, reconciler.logs, calls, request.app.state.closing) if follow else stored(view, calls)
+        chosen = Chosen(controller.access.store.run(job.run), job.id, node, rank, attempt)
+    view, calls = LogView(chosen, positions_of(positions), PIECE), controller.access.followed
+    lines = followed(view, controller.logs, calls, request.app.state.closing) if follow else stored(view, calls)
     return Following(lines, media_type="application/x-ndjson")
 
 
 @router.post("/jobs/{reference}/checkpoint")
 def save_now(request: Request, reference: str) -> dict[str, str]:
     """Have a training job save now; answers when the checkpoint is durable."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    job, attempt, nodes = _running(reconciler, actor, reference, Operation.CHECKPOINT_JOB)
-    return {"answer": _command(reconciler, job, attempt, nodes[0], "checkpoint", 150.0)}
+    controller, actor = controller_of(request), actor_of(request)
+    job, attempt, nodes = _running(controller, actor, reference, Operation.CHECKPOINT_JOB)
+    return {"answer": _command(controller, job, attempt, nodes[0], "checkpoint", 150.0)}
 
 
 @router.get("/jobs/{reference}/stacks")
 def stacks(request: Request, reference: str) -> list[dict[str, Any]]:
     """The Python and native stacks of every rank, node by node."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    job, attempt, nodes = _running(reconciler, actor, reference, Operation.READ_JOB_STACKS)
-    return [{"node": node, "stacks": _command(reconciler, job, attempt, node, "stacks", 60.0)} for node in nodes]
+    controller, actor = controller_of(request), actor_of(request)
+    job, attempt, nodes = _running(controller, actor, reference, Operation.READ_JOB_STACKS)
+    return [{"node": node, "stacks": _command(controller, job, attempt, node, "stacks", 60.0)} for node in nodes]
 
 
-def _running(reconciler: Reconciler, actor: Actor, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
+def _running(controller: Controller, actor: Actor, reference: str, operation: Operation) -> tuple[str, int, list[int]]:
     """Id, attempt and nodes of a running job. Raises ClientError."""
-    with reconciler.database.session() as session:
+    with controller.database.session() as session:
         job = permitted_job(session, actor, reference, operation)
         attempt = job.open_attempt
         if job.status != Status.RUNNING or attempt is None:
@@ -263,20 +263,20 @@ def _running(reconciler: Reconciler, actor: Actor, reference: str, operation: Op
         return job.id, attempt.number, nodes
 
 
-def _command(reconciler: Reconciler, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
+def _command(controller: Controller, job: str, attempt: int, node: int, name: str, seconds: float) -> str:
     try:
-        return reconciler.bus.command(job, attempt, node, name, seconds)
+        return controller.bus.command(job, attempt, node, name, seconds)
     except BusError as error:
         raise ClientError(str(error), 503) from None
 
 
-def _attempt(reconciler: Reconciler, job: Job, number: int) -> dict[str, Any]:
+def _attempt(controller: Controller, job: Job, number: int) -> dict[str, Any]:
     attempt = job.attempts[number - 1]
-    run = reconciler.store.run(job.run)
+    run = controller.access.store.run(job.run)
     nodes = [
         {
             **node.shown(),
-            "progress": reconciler.bus.progress(job.id, number, node.index),
+            "progress": controller.bus.progress(job.id, number, node.index),
             "running": attempt.stopped_at is None and node.exit_code is None,
             "log": str(run.log(job.id, number, node.index)) if attempt.epoch else None,
         }

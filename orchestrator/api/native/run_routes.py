@@ -8,7 +8,7 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Header, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
+from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.services import clone as clones
 from orchestrator.services import lineage, runs
@@ -64,8 +64,8 @@ def list_runs(
     archived: bool = Query(default=False, description="those that are archived, in place of the others"),
 ) -> Any:
     """The runs of the store that the caller may see, by name, a page at a time; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    found = runs.list_runs(reconciler, actor, after, most, search, archived)
+    controller, actor = controller_of(request), actor_of(request)
+    found = runs.list_runs(controller, actor, after, most, search, archived)
     if len(found) == most:
         asked = {**({"search": search} if search else {}), **({"archived": "true"} if archived else {})}
         query = urlencode({"max": most, "after": found[-1]["run"], **asked})
@@ -76,16 +76,16 @@ def list_runs(
 @router.get("/runs/{name}")
 def run_detail(request: Request, name: str) -> Any:
     """One run; ``parent`` is where its weights come from, ``clones`` are the runs that began with its own."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    run = permitted_run(reconciler, actor, name, Operation.READ_RUN)
-    described = runs.describe_run(reconciler, actor, run)
-    return actor.shown({**described, "clones": lineage.clones_of(reconciler, actor, run)})
+    controller, actor = controller_of(request), actor_of(request)
+    run = permitted_run(controller, actor, name, Operation.READ_RUN)
+    described = runs.describe_run(controller, actor, run)
+    return actor.shown({**described, "clones": lineage.clones_of(controller, actor, run)})
 
 
 @router.get("/runs/{name}/checkpoints")
 def run_checkpoints(request: Request, name: str, verify: bool = False) -> list[dict[str, Any]]:
     """The run's committed checkpoints, the newest last; with ``verify`` their digests are checked."""
-    run = permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_CHECKPOINTS)
+    run = permitted_run(controller_of(request), actor_of(request), name, Operation.READ_CHECKPOINTS)
     evaluated, best = by_checkpoint(run), best_checkpoint(run)
     return [
         {
@@ -110,7 +110,7 @@ def _evaluated(summary: dict[str, Any] | None) -> dict[str, Any] | None:
 @router.get("/runs/{name}/evaluations")
 def run_evaluations(request: Request, name: str) -> list[dict[str, Any]]:
     """The summaries of the run's evaluations, the newest last; ``table`` names the Parquet file beside each in ``evaluations/``."""
-    return list_evaluations(permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_EVALUATIONS))
+    return list_evaluations(permitted_run(controller_of(request), actor_of(request), name, Operation.READ_EVALUATIONS))
 
 
 @router.get("/runs/{name}/metrics")
@@ -122,7 +122,7 @@ def run_metrics(
     most: int = Query(default=METRICS_A_PAGE, ge=1, le=METRICS_A_PAGE, alias="max"),
 ) -> list[dict[str, Any]]:
     """The run's metrics, one record an iteration, for the first ``max`` iterations greater than ``after``; the header ``Link`` (``rel="next"``) has the address of the next page."""
-    history = history_of(permitted_run(reconciler_of(request), actor_of(request), name, Operation.READ_METRICS))
+    history = history_of(permitted_run(controller_of(request), actor_of(request), name, Operation.READ_METRICS))
     found = history.after(after, most)
     if len(found) == most or history.behind:
         last = found[-1]["iteration"] if found else after
@@ -138,9 +138,9 @@ def resume_run(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    run = permitted_run(reconciler, actor, name, Operation.RESUME_RUN)
-    return resume(reconciler, actor, run, body.changes(), idempotency_key)
+    controller, actor = controller_of(request), actor_of(request)
+    run = permitted_run(controller, actor, name, Operation.RESUME_RUN)
+    return resume(controller, actor, run, body.changes(), idempotency_key)
 
 
 @router.post("/runs/{name}/clone")
@@ -151,8 +151,8 @@ def clone_run(
     idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
 ) -> dict[str, Any]:
     """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key gets the answer of the first one."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
-    run = permitted_run(reconciler, actor, name, Operation.CLONE_RUN)
+    controller, actor = controller_of(request), actor_of(request)
+    run = permitted_run(controller, actor, name, Operation.CLONE_RUN)
     if body.dry_run:
-        return clones.check_clone(reconciler, actor, run, body.name, body.changes())
-    return clones.clone(reconciler, actor, run, body.name, body.changes(), idempotency_key)
+        return clones.check_clone(controller, actor, run, body.name, body.changes())
+    return clones.clone(controller, actor, run, body.name, body.changes(), idempotency_key)

@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import APIRouter, Header, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, reconciler_of
+from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services.permissions import Operation
 from orchestrator.services.spec_submission import submit_spec
@@ -35,14 +35,14 @@ def submit_job(
 
     ``notes``: warnings about the spec.
     """
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     actor.check(Operation.SUBMIT_SPEC)
     try:
         spec = from_document(body.spec, "spec")
     except SpecError as error:
         raise ClientError(str(error)) from None
     job = submit_spec(
-        reconciler,
+        controller,
         actor,
         spec,
         body.directory,

@@ -10,10 +10,10 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request
 from pydantic import BaseModel, ConfigDict, Field
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.turns import Turns
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError, ServerError, UsageError
 from orchestrator.services.permissions import Operation, Shared
 from orchestrator.spec.tracks import ask
@@ -46,20 +46,20 @@ def list_tracks(
     rings: bool = Query(default=False, description="with the borders, for a drawing"),
 ) -> list[dict[str, Any]]:
     """The presets and the tracks of the store with their measures [m]; one that is damaged has a ``problem`` instead."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     actor.check(Operation.LIST_TRACKS)
     if name is None:
-        found: list[dict[str, Any]] = _ask(reconciler, {"action": "list", "rings": rings})
+        found: list[dict[str, Any]] = _ask(controller, {"action": "list", "rings": rings})
         return found
-    return [_ask(reconciler, {"action": "show", "name": name, "rings": rings})]
+    return [_ask(controller, {"action": "show", "name": name, "rings": rings})]
 
 
 @router.post("/tracks")
 def make_track(request: Request, body: MakeRequest) -> dict[str, Any]:
     """Make a track from a preset or a seed, and keep it in the store, for good."""
-    reconciler, actor = reconciler_of(request), actor_of(request)
+    controller, actor = controller_of(request), actor_of(request)
     actor.check(Operation.MAKE_TRACK, Shared())
-    reconciler.check_writable(adds=True)
+    controller.writes.check(adds=True)
     if (body.preset is None) == (body.seed is None):
         raise ClientError("give one of preset and seed")
     measures = body.model_dump(exclude={"name", "preset", "seed"}, exclude_none=True)
@@ -67,23 +67,23 @@ def make_track(request: Request, body: MakeRequest) -> dict[str, Any]:
         if body.preset is not None and key in measures:
             raise ClientError(f"{key} belongs to seed; a preset's curves follow from its length")
     order = {"action": "make", "name": body.name, "preset": body.preset, "seed": body.seed, "measures": measures}
-    made: dict[str, Any] = _ask(reconciler, order, 400)
+    made: dict[str, Any] = _ask(controller, order, 400)
     return made
 
 
-def picture(reconciler: Reconciler, name: str) -> bytes:
+def picture(controller: Controller, name: str) -> bytes:
     """The PNG of a track. Raises ClientError."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "track.png"
-        _ask(reconciler, {"action": "show", "name": name, "output": str(path)})
+        _ask(controller, {"action": "show", "name": name, "output": str(path)})
         return path.read_bytes()
 
 
-def _ask(reconciler: Reconciler, order: Mapping[str, Any], status: int = 404) -> Any:
+def _ask(controller: Controller, order: Mapping[str, Any], status: int = 404) -> Any:
     """``status``: of the answer where the order can't be carried out. Raises ClientError."""
     try:
         with _turns.turn():
-            return ask({**order, "store": str(reconciler.store.path)})
+            return ask({**order, "store": str(controller.access.store.path)})
     except UsageError as error:
         raise ClientError(str(error), status) from None
     except ServerError as error:

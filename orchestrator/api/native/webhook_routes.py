@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request
 
-from orchestrator.api.http.requests import actor_of, reconciler_of
+from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.control.deliveries import Deliveries
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import CONFLICT
@@ -24,7 +24,7 @@ def list_webhooks(request: Request) -> list[dict[str, Any]]:
     deliveries: Deliveries | None = request.app.state.deliveries
     if deliveries is None:
         return []
-    with reconciler_of(request).database.session() as session:
+    with controller_of(request).database.session() as session:
         return deliveries.described(session)
 
 
