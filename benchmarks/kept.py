@@ -35,7 +35,7 @@ def kept() -> tuple[int, int]:
 
 def end_gangs(bench: Bench[ShortEngine], first: int, last: int) -> None:
     """Let the gangs of these numbers start and end, some at once; the engine forgets them, as a real one does."""
-    queue = bench.reconciler.work_queue
+    queue = bench.controller.work_queue
     for start in range(first, last, AT_ONCE):
         bench.submit(AT_ONCE, first=start)
         bench.wait(lambda: not (queue.waiting() or queue.active()), "all have ended", pause=0.02)

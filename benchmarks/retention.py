@@ -78,7 +78,7 @@ def rounds(bench: Bench[LoggingEngine], jobs: int, count: int, takes: bool = Tru
     """Jobs through the controller, in so many rounds; what there is after each, and after the last pass."""
     found: list[Size] = []
     loop: list[float] = []
-    monitoring = bench.reconciler.monitoring
+    monitoring = bench.controller.monitoring
     took = monitoring.loop_took
 
     def note(seconds: float) -> None:
@@ -90,7 +90,7 @@ def rounds(bench: Bench[LoggingEngine], jobs: int, count: int, takes: bool = Tru
 
     def passes() -> None:
         while not ending.wait(1.0):
-            bench.reconciler.retention.take_all()
+            bench.controller.retention.take_all()
 
     taking = threading.Thread(target=passes, daemon=True)
     trash = bench.home / "store" / "trash"
@@ -141,7 +141,7 @@ def rows_alone(bench: Bench[LoggingEngine], jobs: int, count: int) -> list[Size]
             session.execute(insert(Node), [{"job_id": name, "attempt": 1, "index": 0, "host": "h"} for name in names])
             session.execute(insert(RunRecord), [{"name": name, "queue": "default"} for name in names])
         used = time.process_time()
-        bench.reconciler.retention.take_all()
+        bench.controller.retention.take_all()
         milliseconds = 1000 * (time.process_time() - used) / each
         found.append(size(bench))
         print(f"{(number + 1) * each:7,} through: {found[-1]}; {milliseconds:.2f} ms of CPU a job", flush=True)

@@ -26,8 +26,8 @@ from typing import Any, ClassVar, Generic, TypeVar
 from benchmarks.load import Watch, add_option, own_seconds
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.control.controller import Controller
 from orchestrator.control.peers import Peers
-from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import Progress, RunFacts, RunStore
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import TERMINAL, Status
@@ -105,7 +105,7 @@ class Bench(Generic[E]):
     """A controller, and what it works with."""
 
     home: Path
-    reconciler: Reconciler
+    controller: Controller
     database: Database
     engine: E
     watch: Watch
@@ -129,7 +129,7 @@ class Bench(Generic[E]):
             names = [f"job-{number:06d}" for number in range(start, min(first + count, start + SUBMITTED_AT_ONCE))]
             with self.database.session() as session:
                 session.add_all(self._row(name, document, nodes, attempts) for name in names)
-        self.reconciler.wake()
+        self.controller.alarm.ring()
 
     @staticmethod
     def _row(name: str, document: dict[str, Any], nodes: int, attempts: int) -> Job:
@@ -188,10 +188,10 @@ def controller(
             bus.open()
             stack.callback(bus.close)
         runs = store_type(store, peers)
-        reconciler = Reconciler(database, engines, store, bus, peers, runs=runs, retention=retention)
-        stack.callback(reconciler.close)
-        reconciler.start()
-        yield Bench(home, reconciler, database, engine, watch)
+        controller = Controller.assemble(database, engines, store, bus, peers, runs=runs, retention=retention)
+        stack.callback(controller.close)
+        controller.start()
+        yield Bench(home, controller, database, engine, watch)
 
 
 def is_stopped(engine: FakeEngine, gang: str) -> bool:

@@ -78,7 +78,7 @@ def test_hanging_reads_keep_neither_the_loop_nor_a_stop_nor_a_submission_waiting
             for _ in range(10):
                 assert asked(server, "/healthz").status_code == 200
             assert "muster_store_calls{" in asked(server, "/metrics").text
-            assert server.reconciler.heartbeat.age < 5 and not any(read.done() for read in reads)
+            assert server.controller.heartbeat.age < 5 and not any(read.done() for read in reads)
             client.batch("TerminateJob", jobId=job, reason="enough")
             other = submit_gang(client, "pass")
             described = lambda: client.batch("DescribeJobs", jobs=[other])["jobs"][0]["status"]  # noqa: E731
@@ -100,7 +100,7 @@ def test_no_request_reads_the_store_inside_a_transaction(server: Server) -> None
     with Client(server.url) as client, ThreadPoolExecutor(AT_ONCE) as threads:
         job = submit_gang(client, FOREVER, env={"MUSTER_RUN": "running"})
         await_status(client, job, "RUNNING")
-        server.reconciler.calls.patience = 4.0
+        server.controller.access.calls.patience = 4.0
         paths = list(addresses(server, job))
         assert len(paths) > 20
         for start in range(0, len(paths), AT_ONCE):
@@ -122,13 +122,13 @@ def addresses(server: Server, job: str) -> Iterator[str]:
 
 def connections_of(server: Server) -> int:
     """The connections to the database that requests hold."""
-    pool: Any = server.reconciler.database.engine.pool
+    pool: Any = server.controller.database.engine.pool
     return int(pool.checkedout())
 
 
 def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Server) -> None:
     with Client(server.url) as client, ThreadPoolExecutor(20) as threads:
-        server.reconciler.calls.patience = 4.0
+        server.controller.access.calls.patience = 4.0
         definition = multinode("again", container(env={"MUSTER_RUN": "taught"}))
         registered = client.batch("RegisterJobDefinition", **definition)["jobDefinitionArn"]
         submit = {"jobName": "again", "jobQueue": "default", "jobDefinition": registered}
@@ -142,7 +142,7 @@ def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Serv
                 )
             ]
             time.sleep(1.0)
-            assert not any(each.done() for each in sent) and not server.reconciler.writing.locked()
+            assert not any(each.done() for each in sent) and not server.controller.writes.lock.locked()
             assert connections_of(server) == 0
             submit_gang(client, "pass")
             refused = sent[0].result()
@@ -152,7 +152,7 @@ def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Serv
 
 def test_a_store_whose_volume_is_known_to_be_silent_is_not_even_tried(server: Server) -> None:
     with stalled(server.store.path):
-        wait_for(lambda: server.reconciler.disk.away("store"), 60, "that the volume is silent")
+        wait_for(lambda: server.controller.access.disk.away("store"), 60, "that the volume is silent")
         answer = asked(server, "/api/runs")
         assert answer.status_code == 503 and "has not answered since" in answer.json()["message"]
         assert asked(server, "/api/jobs").status_code == 200
@@ -175,7 +175,7 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
                 "what is missing is not taken for deleted meanwhile"
             )
             # the look before may have found the path empty
-            wait_for(lambda: said in (server.reconciler.disk.away("store") or ""), 60, "that it is seen")
+            wait_for(lambda: said in (server.controller.access.disk.away("store") or ""), 60, "that it is seen")
             answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/tracks", "/runs/taught")]
             for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
                 body = {"name": "copied"}
@@ -193,7 +193,7 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
 
 
 def test_a_download_whose_file_stalls_is_cut_off_and_keeps_nobody_waiting(server: Server) -> None:
-    server.reconciler.calls.patience = 2.0
+    server.controller.access.calls.patience = 2.0
     exports = server.store.run("taught").path / "exports"
     exports.mkdir()
     (exports / "policy.bin").write_bytes(b"policy")
@@ -215,7 +215,7 @@ def test_pages_that_wait_for_the_store_say_so_and_the_others_stay_live(server: S
         with stalled(*hanging(server.store.run("running"))):
             followers = [threads.submit(first_line, server, job) for _ in range(THREADS)]
             assert all("has not answered for 5 s" in each.result() for each in waiting)
-            wait_for(lambda: server.reconciler.followed.open >= THREADS, 30, "looks that hang")
+            wait_for(lambda: server.controller.access.followed.open >= THREADS, 30, "looks that hang")
             for path, name in (("/queues/stream", "queues"), ("/keys/stream", "rows"), ("/jobs/stream", "rows")):
                 assert first_event(server, path, name)
         assert all(each.result() for each in followers), "they go on"
@@ -249,7 +249,7 @@ def test_a_clone_whose_publication_hangs_holds_neither_the_database_nor_the_lock
         cloned = threads.submit(
             httpx.post, f"{server.url}/api/runs/taught/clone", json={"name": "copied"}, timeout=60, trust_env=False
         )
-        wait_for(lambda: "copied" in server.reconciler.beginning, 30, "the publication")
+        wait_for(lambda: "copied" in server.controller.access.beginning, 30, "the publication")
         assert_all_else_goes_on(server, client)
         with pytest.raises(ApiError, match="run copied is being begun by another request"):
             submit_gang(client, "pass", env={"MUSTER_RUN": "copied"})
@@ -258,23 +258,23 @@ def test_a_clone_whose_publication_hangs_holds_neither_the_database_nor_the_lock
         answer = cloned.result().json()
         description = server.store.run("copied").description() or {}
         assert answer["run"] == "copied" and description["job"] == answer["jobId"]
-        assert client.batch("DescribeJobs", jobs=[answer["jobId"]])["jobs"] and not server.reconciler.beginning
+        assert client.batch("DescribeJobs", jobs=[answer["jobId"]])["jobs"] and not server.controller.access.beginning
 
 
 def test_a_teacher_whose_publication_hangs_is_taken_back_when_the_store_answers_again(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    server.reconciler.calls.patience = 6.0
+    server.controller.access.calls.patience = 6.0
     with Client(server.url) as client, ThreadPoolExecutor(1) as threads, ExitStack() as stack:
         pupil = distilling(client)
         stall_after_the_copy(server, stack, monkeypatch)
         submitted = threads.submit(httpx.post, f"{server.url}/v1/submitjob", json=pupil, timeout=60, trust_env=False)
-        wait_for(lambda: server.reconciler.beginning, 30, "the publication")
+        wait_for(lambda: server.controller.access.beginning, 30, "the publication")
         assert_all_else_goes_on(server, client)
         answer = submitted.result()
         assert answer.status_code == 503 and "does not answer (not within 6 s)" in answer.json()["message"]
         stack.close()
-        wait_for(lambda: not server.reconciler.beginning, 30, "that the copy is taken back")
+        wait_for(lambda: not server.controller.access.beginning, 30, "that the copy is taken back")
         assert [path.name for path in (server.store.path / "runs").iterdir() if "pupil" in path.name] == []
         job = client.batch("SubmitJob", **pupil)["jobId"]
         run = server.store.run(client.batch("DescribeJobs", jobs=[job])["jobs"][0]["jobName"] + f"-{job[:8]}")
@@ -314,7 +314,7 @@ def test_copies_of_teachers_that_hang_leave_threads_for_other_requests(server: S
                 threads.submit(httpx.post, f"{server.url}/v1/submitjob", json=pupil, timeout=90, trust_env=False)
                 for _ in range(40)
             ]
-            wait_for(lambda: server.reconciler.calls.open == THREADS, 30, "copies that hang")
+            wait_for(lambda: server.controller.access.calls.open == THREADS, 30, "copies that hang")
             assert_all_else_goes_on(server, client)
         codes = [each.result().status_code for each in sent]
         assert set(codes) == {200, 503} and codes.count(200) >= THREADS
@@ -343,7 +343,7 @@ def distilling(client: Client) -> dict[str, Any]:
 
 def assert_all_else_goes_on(server: Server, client: Client) -> None:
     """Nothing is locked, and jobs are submitted, described and stopped."""
-    wait_for(lambda: not server.reconciler.writing.locked(), 2, "that the lock is free")
+    wait_for(lambda: not server.controller.writes.lock.locked(), 2, "that the lock is free")
     assert connections_of(server) == 0
     job = submit_gang(client, "pass")
     client.batch("TerminateJob", jobId=job, reason="enough")

@@ -78,7 +78,7 @@ class Controller:
 
     def evaluations(self) -> list[tuple[int, str]]:
         """Iteration and state of each evaluation that was submitted, in their order."""
-        with self.server.reconciler.database.session() as session:
+        with self.server.controller.database.session() as session:
             jobs = session.scalars(select(Job).where(Job.name == "evaluate-taught").order_by(Job.created_at, Job.id))
             specs = [(each.node_properties["nodeRangeProperties"][0]["container"], each.status) for each in jobs]
         read = [({e["name"]: e["value"] for e in each["environment"]}, status) for each, status in specs]
@@ -126,7 +126,7 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
     controller.save(80)
     assert [each.iteration for each in list_checkpoints(run)] == [70, 80]
     assert controller.client.get(f"/api/jobs/{training}")["status"] == "RUNNING", "which no evaluation concerns"
-    with controller.server.reconciler.database.session() as session:
+    with controller.server.controller.database.session() as session:
         owners = set(session.scalars(select(Job.owner)))
     assert len(owners) == 1, "the evaluations are the training's owner's"
 
@@ -228,7 +228,7 @@ def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_
     controller.save(90, 100)
     controller.look()
     assert controller.evaluations() == [], "the training itself evaluates its last one"
-    with controller.server.reconciler.database.session() as session:
+    with controller.server.controller.database.session() as session:
         session.get_one(Job, training).stop_reason = "enough"
         session.commit()
         controller.save(95)
@@ -283,7 +283,7 @@ def test_evaluations_that_never_start_are_refused(controller: Controller, line: 
     controller.save(3)
     done = controller.muster(*line.split(), "--set", f"evaluation={{every: 2, {section}}}")
     assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
-    with controller.server.reconciler.database.session() as session:
+    with controller.server.controller.database.session() as session:
         assert not session.scalars(select(Job)).all()
 
 

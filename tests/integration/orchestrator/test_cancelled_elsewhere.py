@@ -30,7 +30,7 @@ def test_a_cancelled_gang_is_started_again_with_a_notice_until_its_limit(
         if most is not None:
             with bench.database.session() as session:
                 session.get_one(ComputeEnvironment, "fake").tags = {"muster:cancellations": str(most)}
-        bench.reconciler.start()
+        bench.controller.start()
         cluster, limit = bench.engine.cluster, 3 if most is None else most
         gang = properties(1, nodes=2, MUSTER_ON_CHILD_FAILURE="restart")
         bench.submit("job", attempts_allowed=9, node_properties=gang)

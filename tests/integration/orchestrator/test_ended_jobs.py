@@ -12,7 +12,7 @@ from sqlalchemy import select
 
 from orchestrator.control import monitoring
 from orchestrator.control.attempts import Attempts
-from orchestrator.control.monitoring import exposition
+from orchestrator.control.exposition import exposition
 from orchestrator.domain.attempt import State
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
@@ -41,12 +41,12 @@ Bench = FakeController[FullEngine]
 def bench(tmp_path: Path) -> Iterator[Bench]:
     with ExitStack() as stack:
         made = FakeController(tmp_path, FullEngine(capacity=Hosts([Host("fake/large", 64.0, (), 65536)])), stack)
-        made.reconciler.start()
+        made.controller.start()
         yield made
 
 
 def series(bench: Bench, name: str) -> list[str]:
-    return [line for line in exposition(bench.reconciler).decode().splitlines() if line.startswith(name)]
+    return [line for line in exposition(bench.controller).decode().splitlines() if line.startswith(name)]
 
 
 def stop(bench: Bench, name: str) -> None:
@@ -66,7 +66,7 @@ def test_nothing_of_an_attempt_stays_in_memory_once_its_job_has_ended_or_it_was_
     bench.submit("waits")
     bench.explains("waits", "no room yet")
     stop(bench, "waits")
-    attempts: Attempts = bench.reconciler.attempts
+    attempts: Attempts = bench.controller.attempts
 
     def kept() -> list[State | Handle]:
         gc.collect()
@@ -82,7 +82,7 @@ def test_series_of_a_queue_end_with_it(bench: Bench) -> None:
     with bench.database.session() as session:
         queue = session.get_one(JobQueue, "urgent")
         queue.deleting = True
-        bench.reconciler.drain(session, queue)
+        bench.controller.upkeep.drain(session, queue)
     bench.wait("urgent", Status.FAILED)
     gone = "that the queue is gone"
 
@@ -106,7 +106,7 @@ def test_a_bounded_number_of_trainings_has_series_and_the_others_are_counted(
         bench.wait(name, Status.RUNNING)
     assert series(bench, "muster_trainings_left_out") == ["muster_trainings_left_out 0.0"]
     progress = {(name, 1, 0): {"iteration": 3, "steps_per_second": 7.5} for name in names[:3]}
-    monkeypatch.setattr(bench.reconciler.bus, "progress", lambda *node: progress.get(node))
+    monkeypatch.setattr(bench.controller.bus, "progress", lambda *node: progress.get(node))
     assert len(series(bench, "muster_training_iteration{")) == 2
     assert len(series(bench, "muster_training_steps_per_second{")) == 2
     assert series(bench, "muster_trainings_left_out") == ["muster_trainings_left_out 1.0"]

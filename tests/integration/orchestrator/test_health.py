@@ -20,10 +20,10 @@ from tests.support.orchestrator.jobs import await_status
 
 
 def test_a_loop_that_is_stuck_makes_the_health_check_fail(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate, look = threading.Event(), inside.reconciler.engine.look
+    gate, look = threading.Event(), inside.controller.engines.look
     health = lambda: httpx.get(f"{inside.url}/healthz", timeout=30)  # noqa: E731
     assert health().status_code == 200
-    monkeypatch.setattr(inside.reconciler.engine, "look", lambda: (gate.wait(120), look()))
+    monkeypatch.setattr(inside.controller.engines, "look", lambda: (gate.wait(120), look()))
     try:
         wait_for(lambda: health().status_code == 503, 60, "that the loop is stuck")
         assert "the controller's loop has made no progress for" in health().json()["message"]
@@ -42,7 +42,7 @@ def test_requests_that_take_every_connection_are_refused_and_leave_the_loop_its_
         with ExitStack() as held, Client(server.url) as client:
             job = submit_gang(client, "import time; time.sleep(3)")
             await_status(client, job, "RUNNING")
-            engine = server.reconciler.database.engine
+            engine = server.controller.database.engine
             engine.pool._timeout = 0.5  # type: ignore[attr-defined]
             while True:
                 try:
@@ -52,7 +52,7 @@ def test_requests_that_take_every_connection_are_refused_and_leave_the_loop_its_
             answer = httpx.get(f"{server.url}/api/jobs", timeout=60)
             assert answer.status_code == 503
             assert "all connections of this controller are busy" in answer.json()["message"]
-            wait_for(lambda: not server.reconciler.work_queue.active(), 60, "that the loop sees the end")
+            wait_for(lambda: not server.controller.work_queue.active(), 60, "that the loop sees the end")
             assert httpx.get(f"{server.url}/healthz").status_code == 200
         with Client(server.url) as client:
             await_status(client, job, "SUCCEEDED")

@@ -141,7 +141,7 @@ def test_after_an_internal_error_a_client_is_served(
     with httpx.Client(base_url=inside.url) as client:
         for _ in range(3):
             with monkeypatch.context() as patched:
-                patched.setattr(inside.reconciler.engine, "capacity", fail)
+                patched.setattr(inside.controller.engines, "capacity", fail)
                 answer = client.get("/api/capacity")
             assert answer.status_code == 500 and answer.headers["connection"] == "close"
             assert answer.json()["message"] == "internal error; the controller's log has the details"

@@ -18,7 +18,7 @@ from sqlalchemy import update
 
 from orchestrator.control import attempts
 from orchestrator.control.attempts import Attempts
-from orchestrator.control.monitoring import exposition
+from orchestrator.control.exposition import exposition
 from orchestrator.domain.attempt import Phase, State, after, step
 from orchestrator.domain.attempt_events import Event
 from orchestrator.domain.attempt_instructions import Instructions
@@ -84,7 +84,7 @@ Bench = FakeController[PoisonedEngine]
 def bench(tmp_path: Path) -> Iterator[Bench]:
     with ExitStack() as stack:
         made = FakeController(tmp_path, PoisonedEngine(), stack)
-        made.reconciler.start()
+        made.controller.start()
         yield made
 
 
@@ -210,7 +210,7 @@ def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_sta
         session.add(row)
     bench.explains("bad", "the controller failed on this job")
     bench.runs_and_ends("good-0", "good-1")
-    assert b'muster_cpus_in_use{engine="fake",queue="default"} 1.0' in exposition(bench.reconciler)
+    assert b'muster_cpus_in_use{engine="fake",queue="default"} 1.0' in exposition(bench.controller)
     [failed] = [record.getMessage() for record in caplog.records if record.exc_info]
     assert failed.startswith("job bad: the controller failed on this job")
 
@@ -243,7 +243,7 @@ def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, mo
     monkeypatch.setattr(attempts, "step", recorded)
     with ExitStack() as stack:
         bench = FakeController(tmp_path, FakeEngine(), stack)
-        bench.reconciler.start()
+        bench.controller.start()
         engine, gangs = bench.engine, bench.engine.cluster.gangs
         engine.error = NotYet("no room yet")
         gang = properties(1, nodes=2, MUSTER_ON_CHILD_FAILURE="restart")
@@ -272,10 +272,10 @@ def test_what_another_controller_changed_meanwhile_counts_once_the_database_is_b
     bench.submit("a", "b")
     for name in ("a", "b"):
         bench.wait(name, Status.RUNNING)
-    database = bench.reconciler.database
-    bench.reconciler._kept = 0.0
+    database = bench.controller.database
+    bench.controller.reconciler._kept = 0.0
     with mock.patch.object(database, "keep_lock", side_effect=DatabaseError("another controller has it")):
-        wait_for(lambda: bench.reconciler.trouble, 20, "that the lock is missed")
+        wait_for(lambda: bench.controller.reconciler.trouble, 20, "that the lock is missed")
         with database.engine.begin() as other:  # as the other controller does: this one is not told
             other.execute(update(Job).where(Job.id == "a").values(stop_reason="enough"))
             moment = {"stopped_at": 1, "ending": "stopped", "spent": True}
@@ -283,13 +283,13 @@ def test_what_another_controller_changed_meanwhile_counts_once_the_database_is_b
             other.execute(update(Job).where(Job.id == "b").values(status="FAILED", status_reason="ended there"))
     assert bench.wait("a", Status.FAILED).status_reason == "enough"
     assert bench.job("b").status_reason == "ended there"
-    wait_for(lambda: not bench.reconciler.bus.presence.expected(), 20, "that no gang is expected")
+    wait_for(lambda: not bench.controller.bus.presence.expected(), 20, "that no gang is expected")
 
 
 def test_a_stop_does_not_wait_for_outcomes_that_can_not_be_read(bench: Bench) -> None:
     bench.submit("a", node_properties=properties(1, 2, MUSTER_ON_CHILD_FAILURE="ignore"), kind="multinode")
     bench.wait("a", Status.RUNNING)
-    runs, answered = bench.reconciler.attempts.runs, threading.Event()
+    runs, answered = bench.controller.attempts.runs, threading.Event()
     outcomes = runs.outcomes
     runs.outcomes = lambda *asked: (answered.wait(60), outcomes(*asked))[1]  # type: ignore[method-assign]
     bench.engine.cluster.end("a/1/1", 1, 0)

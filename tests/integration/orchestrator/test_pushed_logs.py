@@ -67,7 +67,7 @@ class Talk:
 
     def is_pushed(self) -> bool:
         """Whether the nodes push all that they print, and nobody looks at a file."""
-        followed = self.server.reconciler.logs._followed.get(self.job)
+        followed = self.server.controller.logs._followed.get(self.job)
         return followed is not None and followed.logs.delivers() and not followed.is_looked_at
 
 
@@ -102,7 +102,7 @@ def test_lines_come_by_push_alone_while_the_bus_delivers(talk: Talk, monkeypatch
     talk.say("end")
     for thread in talk.threads:
         thread.join(120)
-    assert all(map(talk.has_all, everyone)) and not talk.server.reconciler.logs._followed
+    assert all(map(talk.has_all, everyone)) and not talk.server.controller.logs._followed
     assert all(texts[-1].startswith("node ") for texts in everyone), "the last lines are the supervisors'"
 
 

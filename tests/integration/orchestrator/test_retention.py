@@ -203,14 +203,14 @@ def trained(inside: Server) -> Iterator[str]:
 
 def delete_during(inside: Server, patch: pytest.MonkeyPatch, name: str) -> list[str]:
     """Have the run deleted, as soon as a request has read the store for the first time; what came of it."""
-    calls, outcome = inside.reconciler.calls, list[str]()
+    calls, outcome = inside.controller.access.calls, list[str]()
     call = calls.call
 
     def deleting(body: Callable[[], Any], **options: Any) -> Any:
         result = call(body, **options)
         if not outcome:
             try:
-                inside.reconciler.retention.delete(name)
+                inside.controller.retention.delete(name)
                 outcome.append("deleted")
             except RunNeeded as error:
                 outcome.append(str(error))
@@ -243,7 +243,7 @@ def test_an_evaluation_that_waits_keeps_its_run(inside: Server, http: httpx.Clie
     blocker = http.post(f"/api/runs/{trained}/resume", json={}).json()  # takes the only CPU
     waiting = evaluation(http, trained).json()["jobId"]
     with pytest.raises(RunNeeded, match=f"job {waiting} needs it"):
-        inside.reconciler.retention.delete(trained)
+        inside.controller.retention.delete(trained)
     for job in (blocker.get("jobId"), waiting):
         if job:
             http.post("/v1/terminatejob", json={"jobId": job, "reason": "enough"})
@@ -258,7 +258,7 @@ def test_a_run_that_is_cloned_is_not_deleted_meanwhile_and_never_again(
     assert answer.status_code == 200, answer.text
     assert outcome == [f"run {trained} is used by another request now; try again in a moment"]
     with pytest.raises(RunNeeded, match=f"run clone-{trained} is a clone of it"):
-        inside.reconciler.retention.delete(trained)
+        inside.controller.retention.delete(trained)
     http.post("/v1/terminatejob", json={"jobId": answer.json()["jobId"], "reason": "enough"})
 
 
@@ -272,12 +272,12 @@ def test_a_run_that_is_resumed_is_not_deleted_meanwhile(
     assert outcome == [f"run {trained} is used by another request now; try again in a moment"]
     job = answer.json()["jobId"]
     with pytest.raises(RunNeeded, match=f"job {job} has not ended"):
-        inside.reconciler.retention.delete(trained)
+        inside.controller.retention.delete(trained)
     http.post("/v1/terminatejob", json={"jobId": job, "reason": "enough"})
 
 
 def test_while_a_run_is_deleted_requests_about_it_are_refused(inside: Server, http: httpx.Client, trained: str) -> None:
-    with inside.reconciler.retention.alone(trained):
+    with inside.controller.retention.alone(trained):
         for path, body in (("resume", {}), ("clone", {"name": "late"}), ("models", {"name": "late"}), ("archive", {})):
             answer = http.post(f"/api/runs/{trained}/{path}", json=body)
             assert answer.status_code == 409 and "now; try again in a moment" in answer.text, (path, answer.text)
@@ -296,7 +296,7 @@ def test_archiving_a_run_reads_that_run_alone(
     def scan(_fresh: float) -> None:
         raise AssertionError("what needs runs is looked for in the whole store")
 
-    monkeypatch.setattr(inside.reconciler.retention.stored, "references", scan)
+    monkeypatch.setattr(inside.controller.retention.stored, "references", scan)
     assert http.post(f"/api/runs/{trained}/archive", json={}).json() == {"run": trained, "archived": True}
     http.post(f"/api/runs/{trained}/archive", json={"archived": False}).raise_for_status()
 

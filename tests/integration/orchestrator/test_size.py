@@ -62,7 +62,7 @@ def large_array(http: httpx.Client, queue: str, size: int, **request: Any) -> st
 
 def test_an_array_stores_its_definition_once_for_all_children(inside: Server, http: httpx.Client, waiting: str) -> None:
     array = large_array(http, waiting, 3_000, parameters={"a": "b"}, tags={"c": "d"})
-    with inside.reconciler.database.session() as session:
+    with inside.controller.database.session() as session:
         copies = select(func.count(Job.own_node_properties), func.count()).where(Job.parent == array)
         assert session.execute(copies).one() == (0, 3_000)
     parent, first, last = call(http, "DescribeJobs", jobs=[array, f"{array}:0", f"{array}:2999"])["jobs"]
@@ -71,7 +71,7 @@ def test_an_array_stores_its_definition_once_for_all_children(inside: Server, ht
     assert last["arrayProperties"] == {"index": 2999, "size": 3_000}
     call(http, "TerminateJob", jobId=array, reason="enough")
     call(http, "CancelJob", jobId=array, reason="too late")
-    with inside.reconciler.database.session() as session:
+    with inside.controller.database.session() as session:
         reasons = select(Job.stop_reason, Job.cancelled).where(Job.parent == array).distinct()
         assert [tuple(row) for row in session.execute(reasons)] == [("enough", False)]
     states = lambda: {each["status"] for each in call(http, "DescribeJobs", jobs=[array])["jobs"]}  # noqa: E731
@@ -144,6 +144,6 @@ def test_the_newest_streams_cost_one_statement_however_many_jobs_are_children_of
 
 def test_an_unknown_queue_is_refused_with_the_names_that_the_caller_may_see(inside: Server) -> None:
     actor = Actor("robots", frozenset({"robots"}))
-    with inside.reconciler.database.session() as session, pytest.raises(ClientError) as refused:
-        Context(session, inside.reconciler, actor).queue("nosuch")
+    with inside.controller.database.session() as session, pytest.raises(ClientError) as refused:
+        Context(session, inside.controller, actor).queue("nosuch")
     assert str(refused.value) == "Job queue nosuch does not exist; there is none yet"

@@ -86,7 +86,7 @@ def ended(inside: Server) -> tuple[str, str]:
 @pytest.mark.parametrize("value", ["{broken", "null", "[]"])
 def test_a_damaged_row_harms_no_other(inside: Server, http: httpx.Client, ended: tuple[str, str], value: str) -> None:
     broken, whole = ended
-    home = Path(str(inside.reconciler.database.volume))
+    home = Path(str(inside.controller.database.volume))
     [[kept]] = change(home, "SELECT node_properties FROM jobs WHERE id = ?", broken)
     asked = {"jobQueue": "default", "filters": [{"name": "AFTER_CREATED_AT", "values": ["0"]}]}
     run = http.get(f"/api/jobs/{broken}").json()["run"]
@@ -288,7 +288,7 @@ def test_a_hanging_volume_is_named_and_delays_no_request(inside: Server, monkeyp
     monkeypatch.setattr(os, "statvfs", hanging)
     try:
         with Client(inside.url) as client:
-            wait_for(inside.reconciler.disk.shortage, 30, "that the volume is missed")
+            wait_for(inside.controller.access.disk.shortage, 30, "that the volume is missed")
             waiting = submit_gang(client, "print('at last')")
             [listed] = client.batch("ListJobs", jobQueue="default", jobStatus="RUNNABLE")["jobSummaryList"]
             assert listed["jobId"] == waiting

@@ -139,7 +139,7 @@ def test_an_undeliverable_message_is_given_up(
         job = submit_gang(client, "print(1)")
         wait_for(lambda: all(each["failed"] for each in client.get("/api/webhooks")), 20, "both are given up")
         chat, gone_one = client.get("/api/webhooks")
-        metrics = server.reconciler.monitoring.registry.get_sample_value
+        metrics = server.controller.monitoring.registry.get_sample_value
         counted = {"webhook": "chat", "result": "failed"}, {"webhook": "chat", "result": "given up"}
         assert [metrics("muster_webhook_tries_total", labels) for labels in counted] == [2.0, 1.0]
     (message,) = chat["failed"]
@@ -183,16 +183,16 @@ def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: 
         here = {"url": gone.url}
     file = write_webhooks(tmp_path / "hooks.json", chat=here, trained={**here, "kinds": ["train"]})
     server = Server(tmp_path / "home", cpus=1, webhooks=file)  # nothing is started: nothing is sent
-    with server.reconciler.database.session() as session:
+    with server.controller.database.session() as session:
         session.add_all([rows.job("a", status=Status.RUNNING), rows.job("b", status=Status.RUNNING)])
-    with pytest.raises(RuntimeError), server.reconciler.database.session() as session:
+    with pytest.raises(RuntimeError), server.controller.database.session() as session:
         session.get_one(Job, "a").move(Status.FAILED, "no")
         session.flush()
         raise RuntimeError
-    with server.reconciler.database.session() as session:
+    with server.controller.database.session() as session:
         assert session.scalars(select(WebhookDelivery)).all() == []
         session.get_one(Job, "b").move(Status.SUCCEEDED)
-    with server.reconciler.database.session() as session:
+    with server.controller.database.session() as session:
         (row,) = session.scalars(select(WebhookDelivery))
         assert (row.webhook, row.job, row.tries, row.body) == ("chat", "b", 0, None)
     server.close()
@@ -205,9 +205,9 @@ def test_messages_of_an_unknown_webhook_are_given_up_only_by_a_controller_with_w
         here = {"url": gone.url}
     home = tmp_path / "home"
     server = Server(home, cpus=1, webhooks=write_webhooks(tmp_path / "hooks.json", chat=here))
-    with server.reconciler.database.session() as session:
+    with server.controller.database.session() as session:
         session.add(rows.job("a", status=Status.RUNNING))
-    with server.reconciler.database.session() as session:
+    with server.controller.database.session() as session:
         session.get_one(Job, "a").move(Status.SUCCEEDED)
     server.close()
     for file, problem in (
@@ -216,7 +216,7 @@ def test_messages_of_an_unknown_webhook_are_given_up_only_by_a_controller_with_w
     ):
         server = Server(home, cpus=1, webhooks=file)
         server.start()
-        with server.reconciler.database.session() as session:
+        with server.controller.database.session() as session:
             (row,) = session.scalars(select(WebhookDelivery))
             assert (row.problem or "").startswith(problem or "") and (row.next_at is None) == (problem is not None)
         server.close()

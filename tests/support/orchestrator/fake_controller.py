@@ -8,8 +8,8 @@ from typing import Any, Generic, TypeVar
 
 from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.control.controller import Controller
 from orchestrator.control.peers import Peers
-from orchestrator.control.reconciler import Reconciler
 from orchestrator.control.run_store import RunStore
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import EngineSet
@@ -49,13 +49,15 @@ class FakeController(Generic[E]):
             session.add(JobQueue(name="urgent", priority=9, compute_environments=["fake"]))
         peers = Peers(self.store, home)
         runs = store_type(self.store, peers)
-        self.reconciler = Reconciler(self.database, engines, self.store, Bus(home), peers, interval=0.02, runs=runs)
-        stack.callback(self.reconciler.close)
+        self.controller = Controller.assemble(
+            self.database, engines, self.store, Bus(home), peers, interval=0.02, runs=runs
+        )
+        stack.callback(self.controller.close)
 
     def submit(self, *names: str, **facts: Any) -> None:
         with self.database.session() as session:
             session.add_all(job(name, status=Status.RUNNABLE, **facts) for name in names)
-        self.reconciler.wake()
+        self.controller.alarm.ring()
 
     def job(self, name: str) -> Job:
         with self.database.session() as session:
@@ -70,7 +72,7 @@ class FakeController(Generic[E]):
 
         def reason() -> str:
             found = self.job(name)
-            return self.reconciler.admission.reason(found).words
+            return self.controller.admission.reason(found).words
 
         wait_for(lambda: said in reason(), 30, f"{name} says {said!r}")
 

@@ -11,7 +11,7 @@ from random import Random
 from typing import Any
 
 from orchestrator import machine as seam
-from orchestrator.control.reconciler import Reconciler
+from orchestrator.control.controller import Controller
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.queries import ask_to_end
@@ -68,7 +68,7 @@ class Simulation:
         self.jobs = [draw_job(seed, index) for index in jobs]
         self._named = {job.name: job for job in self.jobs}
         self._faults = [draw_fault(seed, index) for index in faults]
-        self._reconciler: Reconciler | None = None
+        self._controller: Controller | None = None
         self._bus: SimulatedBus | None = None
         self._next_tick = 0.0
         self._committed = False
@@ -86,8 +86,8 @@ class Simulation:
                     self.machine.after(moment, partial(fault, self, rng))
                 self._go_on()
             finally:
-                if self._reconciler is not None:
-                    self._reconciler.engine.close()
+                if self._controller is not None:
+                    self._controller.engines.close()
 
     @property
     def engine_away(self) -> bool:
@@ -105,8 +105,8 @@ class Simulation:
         end = self.machine.time + SUBMITTING + _PATIENCE
         while self.machine.time < end:
             self.machine.step()
-            reconciler, soon = self._reconciler, self.machine.time + _SOON
-            if reconciler is not None and reconciler._wake.is_set() and self._next_tick > soon:
+            controller, soon = self._controller, self.machine.time + _SOON
+            if controller is not None and controller.alarm.rings and self._next_tick > soon:
                 self._tick_at(soon)
             if all(job.final for job in self.jobs):
                 return
@@ -121,7 +121,7 @@ class Simulation:
         try:
             runs = SimulatedRunStore(self)
             self._bus = SimulatedBus(self)
-            self._reconciler = Reconciler(
+            self._controller = Controller.assemble(
                 SimulatedDatabase(self.memory, self),
                 EngineSet([SimulatedEngine(self)]),
                 runs.store,
@@ -130,9 +130,9 @@ class Simulation:
                 disk=SimulatedDisk(self),  # type: ignore[arg-type]
                 runs=runs,
             )
-            self._reconciler.texts._next_sweep = math.inf  # its store has no texts
+            self._controller.texts._next_sweep = math.inf  # its store has no texts
         except (DatabaseError, Crash):
-            self._reconciler = self._bus = None
+            self._controller = self._bus = None
             self.machine.after(2.0, self._start)
             return
         for node in self.cluster.running:
@@ -145,14 +145,14 @@ class Simulation:
         self.machine.after(max(0.0, moment - self.machine.time), lambda: self._tick(process, moment))
 
     def _tick(self, process: int, due: float) -> None:
-        reconciler = self._reconciler
-        if process != self.machine.process or due != self._next_tick or reconciler is None or self._bus is None:
+        controller = self._controller
+        if process != self.machine.process or due != self._next_tick or controller is None or self._bus is None:
             return
         self._bus.listen()
-        reconciler._wake.clear()
+        controller.alarm.clear()
         self.in_loop = True
         try:
-            reconciler._isolation.part("reconciling", reconciler.tick)
+            controller.reconciler._isolation.part("reconciling", controller.reconciler.tick)
         except Crash:
             self.die()
             return
@@ -168,10 +168,10 @@ class Simulation:
 
     def die(self) -> None:
         """Kill the process; another one is started soon."""
-        if self._reconciler is None:
+        if self._controller is None:
             return
         self.note("the controller is killed")
-        self.writes_left = self._reconciler = self._bus = None
+        self.writes_left = self._controller = self._bus = None
         self.machine.process += 1
         self.machine.after(self.rng.uniform(1.0, 30.0), self._start)
 
@@ -197,10 +197,10 @@ class Simulation:
 
     def reasons(self) -> list[tuple[str, str]]:
         """The jobs that wait for room, and the reason that the user of each sees."""
-        assert self._reconciler is not None
+        assert self._controller is not None
         query = "SELECT id, name, status, status_reason FROM jobs WHERE status = 'RUNNABLE'"
         rows = [Job(id=row[0], name=row[1], status=row[2], status_reason=row[3]) for row in self.memory.execute(query)]
-        return [(job.name, self._reconciler.admission.reason(job).aws) for job in rows]
+        return [(job.name, self._controller.admission.reason(job).aws) for job in rows]
 
     # -- the bus ------------------------------------------------------------------------------------------------------
 
@@ -231,9 +231,9 @@ class Simulation:
                 session.add(job.row())
             return {}
 
-        if self._reconciler is not None and self._reconciler.trouble is None:
+        if self._controller is not None and self._controller.reconciler.trouble is None:
             try:
-                self._reconciler.submissions.call(body)
+                self._controller.writes.gather(body)
                 job.acknowledged = True
             except DatabaseError:
                 pass
@@ -243,11 +243,11 @@ class Simulation:
             self.machine.after(_AGAIN, lambda: self._submit(job))
 
     def _ask_to_stop(self, job: SimulatedJob) -> None:
-        if not job.acknowledged or self._reconciler is None:
+        if not job.acknowledged or self._controller is None:
             return
         job.stop_asked = True  # also where the answer is lost: then it may count or not
         try:
-            with self._reconciler.database.session() as session:
+            with self._controller.database.session() as session:
                 ask_to_end(session, Job.id == job.id, "stopped by its user")
         except DatabaseError:
             pass

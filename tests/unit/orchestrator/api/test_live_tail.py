@@ -33,9 +33,8 @@ class World:
         bus: Any = SimpleNamespace(ask_for_logs=lambda *_: None)
         self.calls = StoreCalls(directory)
         self.hub = LogHub(self.database, bus, self.calls)
-        self.reconciler: Any = SimpleNamespace(
-            database=self.database, logs=self.hub, followed=self.calls, store=SimpleNamespace()
-        )
+        access = SimpleNamespace(followed=self.calls, store=SimpleNamespace())
+        self.controller: Any = SimpleNamespace(database=self.database, logs=self.hub, access=access)
         self.streams = list[Stream]()
         self.writers = dict[str, LogWriter]()
 
@@ -50,7 +49,7 @@ class World:
         self.writers[job].append(format_line(1_800_000_000.0, 0, "o", text).encode())
 
     def tail(self) -> LiveTail:
-        return LiveTail(self.reconciler, CONTROLLER, ["group"], lambda _: True, lambda _: True)
+        return LiveTail(self.controller, CONTROLLER, ["group"], lambda _: True, lambda _: True)
 
     @property
     def followers(self) -> int:

@@ -76,7 +76,7 @@ def bench(tmp_path: Path) -> Iterator[tuple[FakeController[FakeEngine], Costs]]:
         made.submit(*(f"job-{number}" for number in range(GANGS - 1)), node_properties=properties(1))
         made.submit("pair", node_properties=properties(1, nodes=2))
         ticks(made, lambda: made.database.counts.by_status() == {Status.RUNNING: GANGS})
-        ticks(made, lambda: min(made.reconciler.work_queue._active.values()) > time.monotonic())
+        ticks(made, lambda: min(made.controller.work_queue._active.values()) > time.monotonic())
         yield made, costs
 
 
@@ -84,7 +84,7 @@ def ticks(bench: FakeController[FakeEngine], condition: Callable[[], bool]) -> N
     """Make passes until the condition holds."""
 
     def there() -> bool:
-        bench.reconciler.tick()
+        bench.controller.reconciler.tick()
         return condition()
 
     wait_for(there, 30, "the state")
@@ -98,7 +98,7 @@ def test_a_pass_in_which_nothing_changed_reads_and_writes_nothing(
 
     def passes() -> None:
         for _ in range(10):
-            controller.reconciler.tick()
+            controller.controller.reconciler.tick()
         ticks(controller, lambda: controller.engine.looks > looks + 2)  # the engine is looked at all the same
 
     costs.watched(passes)
@@ -111,9 +111,9 @@ def test_a_job_that_waits_costs_nothing_between_two_scheduling_passes(
     monkeypatch.setattr(admission, "_PASS_INTERVAL", 3600.0)
     controller, costs = bench
     controller.submit("large", node_properties=properties(4))
-    passed = controller.reconciler.admission._passed
-    ticks(controller, lambda: controller.reconciler.admission._passed[0] > passed[0])
-    costs.watched(controller.reconciler.tick)
+    passed = controller.controller.admission._passed
+    ticks(controller, lambda: controller.controller.admission._passed[0] > passed[0])
+    costs.watched(controller.controller.reconciler.tick)
     assert (costs.statements, costs.store, costs.files) == ([], [], [])
 
 

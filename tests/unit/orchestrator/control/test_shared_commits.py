@@ -33,7 +33,7 @@ def ticks(bench: Bench, condition: Callable[[], bool]) -> None:
     """Make passes until the condition holds."""
 
     def there() -> bool:
-        bench.reconciler.tick()
+        bench.controller.reconciler.tick()
         return condition()
 
     wait_for(there, 30, "the state")
@@ -44,7 +44,7 @@ def are(bench: Bench, status: Status, *names: str) -> Callable[[], bool]:
 
 
 def test_what_a_request_changes_of_a_queue_counts_at_the_next_pass(bench: Bench) -> None:
-    queue, passes = bench.reconciler.work_queue, bench.reconciler.admission
+    queue, passes = bench.controller.work_queue, bench.controller.admission
 
     def pass_of_now() -> bool:
         return bool(passes._passed[0] == queue.version)
@@ -57,7 +57,7 @@ def test_what_a_request_changes_of_a_queue_counts_at_the_next_pass(bench: Bench)
     with bench.database.session() as session:
         session.get_one(JobQueue, "urgent").compute_environments = []
     bench.engine.offered = Hosts([Host("fake/host", 16.0, (), 16384)])
-    bench.reconciler.engine.capacity(patience=10.0)
+    bench.controller.engines.capacity(patience=10.0)
     queue.version += 1
     ticks(bench, pass_of_now)
     assert bench.job("waits").status == Status.RUNNABLE
@@ -112,15 +112,15 @@ def test_an_attempt_whose_end_was_committed_without_an_answer_is_forgotten(
 
     def passed() -> bool:
         try:
-            bench.reconciler.tick()
+            bench.controller.reconciler.tick()
         except DatabaseError as error:
-            bench.reconciler._isolation.trouble = str(error)
+            bench.controller.reconciler._isolation.trouble = str(error)
         with bench.database.session() as session:
             return bool(lost) and session.get_one(Job, "one").status == Status.SUCCEEDED
 
     wait_for(passed, 30, "the end")
-    bench.reconciler.tick()
-    attempts = bench.reconciler.attempts
+    bench.controller.reconciler.tick()
+    attempts = bench.controller.attempts
     assert list(attempts._open) == ["two"]
     [runner] = attempts.engine._runners.values()
     assert [handle.gang for handle in runner._observed] == ["two/1/1"]
