@@ -1,4 +1,4 @@
-"""A controller's metrics for Prometheus: counters since it began, and values at the moment of a scrape.
+"""Monitoring of a controller by Prometheus: counters since it began, and values at the moment of a scrape.
 
 Names and units are Prometheus's: base units, ``_total`` for what only grows. Counters begin at 0 with each controller, as Prometheus
 expects. Nothing here looks into the store or waits for an engine: a volume that hangs keeps no scrape waiting.
