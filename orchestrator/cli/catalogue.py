@@ -1,4 +1,4 @@
-"""All commands, with one line each. A command's module is imported on use; `muster --help` imports none."""
+"""The catalogue of all commands, with one line each. A command's module is imported on use; `muster --help` imports none."""
 
 from __future__ import annotations
 

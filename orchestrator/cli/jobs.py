@@ -1,4 +1,4 @@
-"""``muster submit``, ``stop``, ``checkpoint``, ``stacks``, ``schema``."""
+"""Commands for jobs: ``muster submit``, ``stop``, ``checkpoint``, ``stacks``, ``schema``."""
 
 from __future__ import annotations
 

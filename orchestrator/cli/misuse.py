@@ -1,4 +1,4 @@
-"""Usage errors in one line: the input, the mistake, the nearest name, and the help to read."""
+"""Misuse of the command line, reported in one line: the input, the mistake, the nearest name, and the help to read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The output of ``--dry-run``: the host of each node that a job would start."""
+"""Plans as ``--dry-run`` prints them: the host of each node that a job would start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Follow a job to its end: a live bar on a terminal, plain lines otherwise, and the results."""
+"""The progress of a job, followed to its end: a live bar on a terminal, plain lines otherwise, and the results."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``muster resume`` and ``muster checkpoints``."""
+"""Commands for runs: ``muster resume`` and ``muster checkpoints``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The console's own scripts and styles, served under an address that changes with their content, and so cached for ever."""
+"""The console's assets: scripts and styles under an address that changes with their content, so that browsers cache them for ever."""
 
 from __future__ import annotations
 

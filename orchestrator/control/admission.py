@@ -1,4 +1,4 @@
-"""Scheduling passes: which waiting jobs start, which running ones make room for them, and why the others wait."""
+"""The admission of jobs: which waiting ones a scheduling pass starts, which running ones make room, and why the others wait."""
 
 from __future__ import annotations
 

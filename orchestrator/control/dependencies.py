@@ -1,4 +1,4 @@
-"""Jobs that have no gang: ended on request, held back by others, an array by its children, or ready to run."""
+"""Jobs without a gang: their dependencies, ends on request, the end of an array by its children, and readiness to run."""
 
 from __future__ import annotations
 

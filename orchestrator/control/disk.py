@@ -1,4 +1,4 @@
-"""Free space of the volumes that the controller writes to: below a minimum nothing new is started or accepted there."""
+"""Free disk space of the volumes that the controller writes to: below a minimum nothing new is started or accepted there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The end of a node: by its outcome in the store, else as its engine saw it."""
+"""The ending of a node: by its outcome in the store, else as its engine saw it."""
 
 from __future__ import annotations
 

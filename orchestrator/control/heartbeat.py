@@ -1,4 +1,4 @@
-"""The signs of life of the controller's loop: the loop leaves them, and any thread reads them without waiting."""
+"""The heartbeat of the controller's loop: the loop leaves signs of life, and any thread reads them without waiting."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Keeps failures apart: a part of a pass that fails stops no other part, and a job that fails no other job."""
+"""The isolation of failures: a part of a pass that fails stops no other part, and a job that fails no other job."""
 
 from __future__ import annotations
 

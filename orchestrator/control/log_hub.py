@@ -1,4 +1,4 @@
-"""Followers of logs, and what they share: nodes push their lines over the bus, and one reader a job fills what is missing.
+"""The hub of followed logs: nodes push their lines over the bus, and one reader a job fills what is missing for all followers.
 
 While somebody follows a job, its nodes are asked to push (:data:`shared_store.contract.bus.LOG_LEASE`), and each tells once a second where its log
 ends. As long as all of them do and nothing is missing, nobody looks at a file. Otherwise (no bus, an engine without one, a lost push, a

@@ -1,4 +1,4 @@
-"""The newest part of the logs of one followed job, in memory: what nodes push, and what one reader finds in the files, for all followers.
+"""The tails of a followed job's logs, in memory: what nodes push, and what one reader finds in the files, for all followers.
 
 Positions are bytes of a log. A push may be lost, doubled or come out of order: it counts where it continues what is known, is kept
 where something before it is missing, and dropped where too much is missing. The file has it all.

@@ -1,4 +1,4 @@
-"""What the controller knows of a gang: by its engine, by the bus, and by the outcomes that its nodes leave in the store."""
+"""The observer of gangs: it learns of them from their engines, the bus, and the outcomes that their nodes leave in the store."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The controllers that use a store: each leaves a heartbeat there, and reads those of the others.
+"""The peers of a controller, which use the same store: each leaves a heartbeat there, and reads those of the others.
 
 Controllers of several homes may share a store, each with jobs of its own; a run that one of them writes is not started by another.
 Heartbeats are advice: what keeps two gangs apart is the epoch (:mod:`shared_store.volume.epoch`).

@@ -1,4 +1,4 @@
-"""The nodes that the bus hears, and what the silence of the others proves. Pure: no network, no thread, no clock but the one it gets.
+"""The presence of nodes: those that the bus hears, and what the others' silence proves. Pure: no network, no thread, no clock but the one it gets.
 
 Silence proves nothing by itself: the node may have died, its network may be down, or this controller is the one that is cut off. A node is
 lost once it alone has been silent for ``lost_after``, while its engine says that it runs and somebody else is heard. Otherwise it is

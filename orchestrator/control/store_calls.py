@@ -1,4 +1,4 @@
-"""The store as requests use it: a pool of threads for its volume, with deadlines, since the volume may hang.
+"""Calls on the store for requests: a pool of threads for its volume, with deadlines, since the volume may hang.
 
 Whoever waits for the store holds neither the database nor a lock meanwhile.
 """

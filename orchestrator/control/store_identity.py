@@ -1,4 +1,4 @@
-"""Which store a database belongs to: another or an empty volume under its path is not taken for it."""
+"""The identity of a database's store: another or an empty volume under the store's path is not taken for it."""
 
 from __future__ import annotations
 

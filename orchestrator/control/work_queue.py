@@ -1,4 +1,4 @@
-"""The controller's memory of the jobs that are not over: those that wait for resources, those with a gang, and those due for a look.
+"""The controller's work queue, in memory: jobs that wait for resources, those with a gang, and those due for a look.
 
 It follows every commit, and is read anew from the database at a start, so that 100,000 waiting jobs cost no query a look.
 """

@@ -1,4 +1,4 @@
-"""Bounded text for messages: an error about a request, a file or a program stays short, however long their text is."""
+"""Excerpts for messages: an error about a request, a file or a program stays short, however long their text is."""
 
 from __future__ import annotations
 

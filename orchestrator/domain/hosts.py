@@ -1,4 +1,4 @@
-"""Machines, the capacity of engines, and the placement of a gang's nodes."""
+"""Hosts, the capacity of engines, and the placement of a gang's nodes."""
 
 from __future__ import annotations
 

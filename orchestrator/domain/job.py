@@ -1,4 +1,4 @@
-"""Jobs and attempts: the states of AWS Batch, their legal transitions, and the verdict on a gang's end. No I/O."""
+"""A job and its attempts: the states of AWS Batch, their legal transitions, and the verdict on a gang's end. No I/O."""
 
 from __future__ import annotations
 

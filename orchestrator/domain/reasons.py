@@ -1,4 +1,4 @@
-"""Why a job waits or has ended: in Muster's words, and as AWS Batch states it."""
+"""Reasons why a job waits or has ended: in Muster's words, and as AWS Batch states them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Amounts of CPUs, GPUs and memory: requested, free or allocated, in one type."""
+"""Resources in one type: amounts of CPUs, GPUs and memory that are requested, free or allocated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The engine protocol: the interface to the systems that start processes on machines."""
+"""The API of engines: the protocol by which Muster uses the systems that start processes on machines."""
 
 from __future__ import annotations
 

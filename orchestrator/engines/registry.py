@@ -1,4 +1,4 @@
-"""Several engines as one, for the controller. A host's name and a gang's handle name their engine."""
+"""The registry of engines: several of them as one, for the controller. A host's name and a gang's handle name their engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Threads for each engine: the controller asks, reads the newest answer, and never waits for an engine.
+"""The runner of each engine, with threads of its own: the controller asks, reads the newest answer, and never waits for an engine.
 
 An engine that hangs (a Docker daemon that accepts connections and does not answer, a cloud behind a broken route) delays its own gangs
 alone. Those keep the state that was seen last, and can still be timed out and asked to stop; gangs of other engines notice nothing.

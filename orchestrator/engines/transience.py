@@ -1,4 +1,4 @@
-"""Which errors of the operating system pass by themselves. Pure."""
+"""The transience of errors: which errors of the operating system pass by themselves. Pure."""
 
 from __future__ import annotations
 

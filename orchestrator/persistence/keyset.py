@@ -1,4 +1,4 @@
-"""Pages by a place in an order, not by a number: none repeats or skips a row when rows come or go, and each costs the same."""
+"""Keyset pagination: pages by a place in an order, not by a number. None repeats or skips a row, and each costs the same."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Finding jobs in the database, and changing many at once."""
+"""Queries that find jobs in the database, and statements that change many at once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What in the database needs which run or job, and the facts about jobs on which retention decides."""
+"""References in the database to runs and jobs, and the facts about jobs on which retention decides."""
 
 from __future__ import annotations
 

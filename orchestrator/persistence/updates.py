@@ -1,4 +1,4 @@
-"""Changed columns of many rows in one statement a kind of change: the unit of work would send one statement a row."""
+"""Updates of many rows: one statement for each kind of change, where the unit of work would send one a row."""
 
 from __future__ import annotations
 

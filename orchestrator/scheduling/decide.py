@@ -1,4 +1,4 @@
-"""One scheduling pass: which jobs start and where, which are preempted or cancelled, and why the others wait."""
+"""The decisions of one scheduling pass: which jobs start and where, which are preempted or cancelled, and why the others wait."""
 
 from __future__ import annotations
 

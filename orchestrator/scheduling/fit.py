@@ -1,4 +1,4 @@
-"""Placement of a gang on an idle cluster: passes, plans, submissions and resumes use it to refuse gangs that can never start."""
+"""The fit of a gang on an idle cluster: passes, plans, submissions and resumes use it to refuse gangs that can never start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results shared in one pass by all queues with the same compute environments: a shape that did not fit once is not tried again."""
+"""A cache for one pass: queues with the same compute environments share results, so a shape that did not fit once is not tried again."""
 
 from __future__ import annotations
 

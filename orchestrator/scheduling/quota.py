@@ -1,4 +1,4 @@
-"""The part of a fair-share queue's capacity that is kept for inactive shares (``computeReservation``)."""
+"""The quota of inactive shares: the part of a fair-share queue's capacity that is kept for them (``computeReservation``)."""
 
 from __future__ import annotations
 

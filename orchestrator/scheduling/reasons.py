@@ -1,4 +1,4 @@
-"""Why a job waits, in words that a user can act on; worded only for jobs that are asked about."""
+"""The reasons why jobs wait, in words that a user can act on; worded only for jobs that are asked about."""
 
 from __future__ import annotations
 

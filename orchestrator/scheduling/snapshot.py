@@ -1,4 +1,4 @@
-"""The input of a scheduling pass: jobs, queues, compute environments, hosts and the clock. Values only.
+"""A snapshot as the input of a scheduling pass: jobs, queues, compute environments, hosts and the clock. Values only.
 
 Times are in milliseconds, on a clock that never steps (:mod:`orchestrator.control.clock`).
 """

@@ -1,4 +1,4 @@
-"""Jobs whose row in the database is damaged: requests about them fail, requests about others don't."""
+"""Damaged rows of jobs in the database: requests about them fail, requests about others don't."""
 
 from __future__ import annotations
 

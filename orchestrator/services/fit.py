@@ -1,4 +1,4 @@
-"""Whether a job could ever start, and where: one answer for plans, submissions, resumes and clones."""
+"""The fit of a job: whether it could ever start, and where, in one answer for plans, submissions, resumes and clones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which runs began with the weights of which."""
+"""The lineage of runs: which of them began with the weights of another."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The other runs that a job from YAML reads: those that it evaluates, exports or shows, and the teacher that its policy imitates."""
+"""The sources of a job from YAML: runs that it evaluates, exports or shows, and the teacher that its policy imitates."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The job YAML: its schema; errors name file, line and key.
+"""The pydantic model of the job YAML: its schema, and errors that name file, line and key.
 
 The spec compiles to ``RegisterJobDefinition`` and ``SubmitJob`` requests (:mod:`orchestrator.spec.compile`); there is no second
 job model. It is carried whole in the definition's environment, so that a run can be resumed with changes.

@@ -1,4 +1,4 @@
-"""``muster-policy BUNDLE``: run a policy bundle on a robot."""
+"""The CLI of the policy node: ``muster-policy BUNDLE`` runs a policy bundle on a robot."""
 
 from __future__ import annotations
 

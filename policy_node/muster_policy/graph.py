@@ -1,4 +1,4 @@
-"""A ROS 2 node on a Zenoh session: its tokens, publishers and subscriptions, and who else is there."""
+"""The ROS 2 graph of a Zenoh session: a node with its tokens, publishers and subscriptions, and who else is there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The policy's inputs, built from measurements by the contract: scale, clip, offsets, history, frames of a camera."""
+"""The policy's observations, built from measurements by the contract: scale, clip, offsets, history, frames of a camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The control step: from measurements to a command, or to none; independent of clocks and networks."""
+"""The runner of a control step: from measurements to a command, or to none; independent of clocks and networks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The measurements of one moment, and the quantities derived from them."""
+"""A snapshot of the measurements of one moment, and the quantities derived from them."""
 
 from __future__ import annotations
 

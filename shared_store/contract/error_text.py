@@ -1,4 +1,4 @@
-"""One-line errors about values of a job's YAML, with the same words at the submission and from a rank."""
+"""The text of errors about values of a job's YAML: one line, with the same words at the submission and from a rank."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a training does at present, as its main rank reports it to the supervisor, and the supervisor to the bus."""
+"""The phases of a training: what it does at present, as the main rank reports it to the supervisor, and the supervisor to the bus."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a policy would misunderstand: the differences between two policy contracts, one line each."""
+"""Changes that a policy would misunderstand: the differences between two policy contracts, one line each."""
 
 from __future__ import annotations
 

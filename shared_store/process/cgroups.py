@@ -1,4 +1,4 @@
-"""Control groups (version 2) around nodes: no process of a node can leave its group, whatever sessions and forks it uses.
+"""Control groups (cgroups, version 2) around nodes: no process of a node can leave its group, whatever sessions and forks it uses.
 
 They are used if this process may create groups below its own: as root, or with delegation (``systemd-run --user --scope -p
 Delegate=yes``). A trial decides. Of the controllers only that of memory is used: :mod:`shared_store.process.memory_groups`. Linux only.

@@ -1,4 +1,4 @@
-"""What lies in a run's directory: Muster's records, logs of jobs, results; and whether the run is archived.
+"""The contents of a run's directory: Muster's records, logs of jobs, results; and whether the run is archived.
 
 Everything that is not known here counts as a result: a program may leave files of any name in its run.
 """

@@ -1,4 +1,4 @@
-"""Atomic writes: after any crash, a reader sees either the old content or the new one.
+"""Files that are written atomically: after any crash, a reader sees either the old content or the new one.
 
 The rules also hold on NFS and EFS: new content goes under a hidden name in the same directory, is fsynced and closed (NFS reports a
 full disk at the close), is renamed, and the directory is fsynced.

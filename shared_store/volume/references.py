@@ -1,4 +1,4 @@
-"""What in the store needs which run: models, entries of leagues, clones, and policies that imitate a teacher.
+"""References to runs in the store: from models, entries of leagues, clones, and policies that imitate a teacher.
 
 A new kind of thing that needs runs adds a function to :data:`REFERRERS`.
 """

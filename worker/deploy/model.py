@@ -1,4 +1,4 @@
-"""A policy as files that other programs run: ONNX and TorchScript; and such a file as a policy again."""
+"""The model file of an exported policy, ONNX or TorchScript, which other programs run; and such a file as a policy again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether an exported policy does what the trained one does: on observations of real roll-outs, their extremes, and made-up ones."""
+"""The parity of an exported policy with the trained one: on observations of real roll-outs, their extremes, and made-up ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A policy that is asked about a fixed number of worlds at a time, whatever number there are.
+"""Blocks of worlds: a policy is asked about a fixed number of worlds at a time, whatever number there are.
 
 The products of a network round otherwise for another number of rows. In blocks of one size, in which an episode always has the same row,
 an action is a function of the observation and the row alone.

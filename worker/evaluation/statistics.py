@@ -1,4 +1,4 @@
-"""Means, shares and differences with their 95 % confidence intervals.
+"""Statistics with their 95 % confidence intervals: means, shares and differences.
 
 Sources: Student (1908) for a mean; Wilson (1927), "Probable inference, the law of succession, and statistical inference", for a share;
 Welch (1947), "The generalization of Student's problem when several different population variances are involved", for a difference.

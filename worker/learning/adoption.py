@@ -1,4 +1,4 @@
-"""The start of a clone: from a copy of another run's weights in its own run directory (:mod:`shared_store.volume.initial_weights`)."""
+"""The adoption of another run's weights by a clone: it begins with the copy in its own directory (:mod:`shared_store.volume.initial_weights`)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A rank's progress messages to its supervisor: one JSON line each on an inherited pipe, without waiting."""
+"""The beacon of a rank: its progress messages to its supervisor, one JSON line each on an inherited pipe, without waiting."""
 
 from __future__ import annotations
 

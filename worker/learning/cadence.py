@@ -1,4 +1,4 @@
-"""The schedule of saves."""
+"""The cadence of saves: when the next checkpoint is due."""
 
 from __future__ import annotations
 

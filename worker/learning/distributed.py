@@ -1,4 +1,4 @@
-"""A gang of ranks: who is there, the process group, and the few collectives that training needs.
+"""Distributed training by a gang of ranks: who is there, the process group, and the few collectives that training needs.
 
 :func:`connect` first lets every rank report to the main rank's TCP store (cheap, before anything slow) so that a rank that never
 came is *named*, then opens the process group (NCCL on CUDA, Gloo elsewhere) and proves it with one all-reduce.

@@ -1,4 +1,4 @@
-"""Log lines about errors in a user's functions, such as a learner's reward."""
+"""Failures of a user's functions, such as a learner's reward, as lines of the log."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The running mean and variance of observations, over all ranks: sums of an iteration, and how they are merged."""
+"""The moments of observations over all ranks: their running mean and variance, sums of an iteration, and how these are merged."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The threads that read and write the volume for a training, so that the training thread waits for neither disk nor network.
+"""The reporter and the fence of a training: threads that read and write the volume, so that the training thread waits for no disk or network.
 
 If the volume is away for an hour, the run loses only its newest metrics.
 """

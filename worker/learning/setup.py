@@ -1,4 +1,4 @@
-"""The parts of a training, before it begins: this rank's worlds, the gang's number of worlds, and their description in checkpoints."""
+"""The setup of a training: this rank's worlds, the gang's number of worlds, and their description in checkpoints."""
 
 from __future__ import annotations
 

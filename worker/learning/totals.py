@@ -1,4 +1,4 @@
-"""Named numbers in one buffer, to be summed over the ranks."""
+"""Totals over the ranks: named numbers in one buffer, to be summed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Load a policy from a checkpoint, without its job and without a simulation."""
+"""Trained policies from checkpoints, loaded without their job and without a simulation."""
 
 from __future__ import annotations
 

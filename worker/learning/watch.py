@@ -1,4 +1,4 @@
-"""What the records of a training say against it: it unlearns, it no longer explores, or its learning rate can't follow."""
+"""The watch over a training, by its records: whether it unlearns, no longer explores, or has a learning rate that can't follow."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A line from each child node to the main node, by which the main node learns how they end.
+"""The lifeline from each child node to the main node, by which the main node learns how they end.
 
 For engines that leave the main node running when a child dies (AWS Batch). The kernel closes a dead supervisor's connection at
 once, and asks a silent host whether it is still there; nobody has to write anything while all is well. Imports no torch.

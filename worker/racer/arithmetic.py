@@ -1,4 +1,4 @@
-"""Sines, cosines and lengths that have the same bits on every machine.
+"""Arithmetic with the same bits on every machine: sines, cosines, lengths, and distances to lines.
 
 Libraries that compute sines differ in their last digits from processor to processor. Sums, products, quotients and square roots do not:
 IEEE 754 rounds them in one way. Made tracks use nothing else, so a seed means the same bytes everywhere.

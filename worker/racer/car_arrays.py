@@ -1,4 +1,4 @@
-"""The state of every world's car, and the Warp functions that fill it in: motion, place on the track, ends, obstacles."""
+"""Arrays with the state of every world's car, and the Warp functions that fill them in: motion, place on the track, ends, obstacles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Requirements of a track before a car may drive on it; each refusal is one line: the fault, its row and its place."""
+"""Checks of a track before a car may drive on it; each refusal is one line: the fault, its row and its place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The scene that all worlds of a task share: tracks side by side, and boxes on them."""
+"""The circuit: the scene that all worlds of a task share, with tracks side by side, and boxes on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks drawn from a seed: closed curves whose radius about the middle is a sum of waves.
+"""The generator of tracks from a seed: closed curves whose radius about the middle is a sum of waves.
 
 The same seed and measures give the same bytes on every machine (:mod:`worker.racer.arithmetic`), in every version of Muster: a job
 names a track as ``random:SEED``.

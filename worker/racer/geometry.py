@@ -1,4 +1,4 @@
-"""A car's place on its track: the quantities from which tasks and reward functions are made.
+"""The geometry of a car's place on its track: the quantities from which tasks and reward functions are made.
 
 Everything is a batch of points against all segments of the centre line, in the order in which a kernel would do it for one point:
 look for the nearest segment, then take the rest from it. Of several nearest segments the first one counts.

@@ -1,4 +1,4 @@
-"""Names of tracks in a job: a preset (``oval``), a seed (``random:7``), or a name in the store."""
+"""The naming of tracks in a job: a preset (``oval``), a seed (``random:7``), or a name in the store."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks of exact straights and arcs: ``oval``, ``rounded-rectangle``, ``chicane``."""
+"""Track presets of exact straights and arcs: ``oval``, ``rounded-rectangle``, ``chicane``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Cars that are put back: what went wrong in a control step, where the car then stands, and how often that happened in its episode."""
+"""Resets of cars: what went wrong in a control step, where the car is put back, and how often that happened in its episode."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The arguments of a learner's reward function for every car, filled on the device after each control step, and the function itself."""
+"""The inputs of a learner's reward function for every car, filled on the device after each control step, and the function itself."""
 
 from __future__ import annotations
 

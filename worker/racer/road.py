@@ -1,4 +1,4 @@
-"""Tracks on the device, and where a point is on its track: :mod:`worker.racer.geometry` as Warp functions, for one point each.
+"""The road on the device: tracks, and where a point is on its track, as Warp functions for one point each (:mod:`worker.racer.geometry`).
 
 Several tracks lie one behind the other in the same arrays; every function has an argument for the track.
 """

@@ -1,4 +1,4 @@
-"""SimTrace files: a row for each control step of an episode, and beside them what log tools look for, as DeepRacer has them.
+"""The simulation trace (SimTrace files): a row for each control step of an episode, and files that log tools need, as DeepRacer has them.
 
 The layout is that of a model that DeepRacer on AWS exports, which ``deepracer-utils`` reads (``DeepRacerLog(folder)``):
 ``sim-trace/training/NAME/training-simtrace/``, ``sim-trace/evaluation/NAME/evaluation-simtrace/``, ``model/`` and ``ip/``.

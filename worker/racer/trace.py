@@ -1,4 +1,4 @@
-"""The values of each control step for race results and SimTrace files, noted on the device before an ended episode begins anew."""
+"""The trace of a control step: values for race results and SimTrace files, noted on the device before an ended episode begins anew."""
 
 from __future__ import annotations
 

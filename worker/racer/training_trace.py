@@ -1,4 +1,4 @@
-"""SimTrace files of a training: every control step of the main rank's first cars, noted on the device and brought over once an iteration.
+"""The trace of a training in SimTrace files: every control step of the main rank's first cars, brought over once an iteration.
 
 Whole episodes are written: a file has those that ended in its iteration. Episodes that a checkpoint finds unfinished are kept beside the
 files under its iteration, so that a run that goes on from it writes what it would have written without the interruption.

@@ -1,4 +1,4 @@
-"""What a job accepts of a task that differs from that of a policy's training. Imported without torch and without the simulation."""
+"""Changes of a task since a policy's training that a job accepts. Imported without torch and without the simulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Apply the settings of a job's YAML (``train.config``) to a task's configuration, or refuse them. Imported without torch."""
+"""Overrides of a task's configuration by a job's YAML (``train.config``): applied, or refused. Imported without torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The configuration of the four-legged robot that follows velocity commands."""
+"""The configuration of the quadruped, the four-legged robot that follows velocity commands."""
 
 from __future__ import annotations
 

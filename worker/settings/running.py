@@ -1,4 +1,4 @@
-"""The configurations of the robots that run along +x."""
+"""The configurations of the running robots, which run along +x."""
 
 from __future__ import annotations
 

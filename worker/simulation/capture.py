@@ -1,4 +1,4 @@
-"""Record a sequence of Warp launches once and replay it, on CPU and CUDA."""
+"""The capture of a sequence of Warp launches: recorded once and replayed, on CPU and CUDA."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Physics that differs between worlds, declared by pattern: quantity, parts, range, and time of the draws.
+"""The declared randomisation of physics, which differs between worlds: quantity, parts by pattern, range, and time of the draws.
 
 >>> Randomize("friction", geoms="*_foot", range=(0.3, 1.2), operation="set")
 >>> Randomize("center_of_mass", bodies="trunk", range={"x": (-0.025, 0.025), "z": (-0.03, 0.03)}, operation="add")

@@ -1,4 +1,4 @@
-"""Processing of a robot's inputs before each physics step: delays, and motors whose force is computed explicitly."""
+"""The drives of a robot before each physics step: delays of its inputs, and motors whose force is computed explicitly."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constants that MuJoCo derives from masses and armatures, recomputed for selected worlds.
+"""Inverse weights and other constants that MuJoCo derives from masses and armatures, recomputed for selected worlds.
 
 MuJoCo scales the softness of contacts, joint limits and dry friction by ``dof_invweight0`` and ``body_invweight0``: mean diagonals of
 ``J M^-1 J^T`` in the model's reference pose. mujoco_warp's ``set_const`` finds them with a solve of the whole mass matrix for each

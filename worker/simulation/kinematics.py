@@ -1,4 +1,4 @@
-"""Poses and velocities of a robot's root and of its bodies, and rotations, as functions that kernels call.
+"""The kinematics of a robot's root and of its bodies: poses, velocities and rotations, as functions that kernels call.
 
 Quaternions are xyzw and turn a body's frame to the world's. A body has two linear velocities: that of its centre of mass, which
 Newton keeps (``joint_qd`` of a free joint, ``body_qd``), and that of its frame's origin, which MuJoCo, mjlab and Isaac Lab call the

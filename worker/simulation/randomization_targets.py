@@ -1,4 +1,4 @@
-"""Look-up of randomised quantities in the model: from names and patterns to columns of arrays."""
+"""The targets of randomisations in the model: from names and patterns to columns of arrays."""
 
 from __future__ import annotations
 

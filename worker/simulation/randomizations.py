@@ -1,4 +1,4 @@
-"""Declared quantities of the model, drawn for each world at startup, at resets and at intervals.
+"""The randomisations of the model: declared quantities, drawn for each world at startup, at resets and at intervals.
 
 The draws are state. The model's values are computed from them and from its original values, so changes never compound and a run resumes
 from its state bit for bit.

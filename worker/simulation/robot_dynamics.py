@@ -1,4 +1,4 @@
-"""What no field of a robot's model shows: other accelerations, and constraints of another softness."""
+"""Differences in dynamics that no field of a robot's model shows: other accelerations, and constraints of another softness."""
 
 from __future__ import annotations
 

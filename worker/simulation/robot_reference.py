@@ -1,4 +1,4 @@
-"""A robot's file as MuJoCo's own compiler reads it: what the robot must be."""
+"""The reference for a robot: its file as MuJoCo's own compiler reads it, which says what the robot must be."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A robot twice: as MuJoCo compiles its file, and as the builder made of that file becomes; and which element is which."""
+"""The twins of a robot: its file as MuJoCo compiles it, the model that the builder becomes, and which element is which."""
 
 from __future__ import annotations
 

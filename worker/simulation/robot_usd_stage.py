@@ -1,4 +1,4 @@
-"""A USD file of a robot beside what Newton's importer built of it: prims, places, and values to compare."""
+"""The USD stage of a robot beside what Newton's importer built of it: prims, places, and values to compare."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The joints, bodies, sites and geoms of one robot or object, by name, and their columns in the arrays of a world."""
+"""A view of one robot or object: its joints, bodies, sites and geoms, by name, and their columns in the arrays of a world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The terrain in kernels: the height at a point, and the patch of each world."""
+"""Arrays of the terrain for kernels: the height at a point, and the patch of each world."""
 
 from __future__ import annotations
 

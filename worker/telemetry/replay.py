@@ -1,4 +1,4 @@
-"""A recording read back for the live view: whole, or as much as there is of one that was cut short."""
+"""The replay of a recording in the live view: whole, or as much as there is of one that was cut short."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A checkpoint's policy on a few fresh worlds, as recordings and pictures show it: the mean action, in the order of a control step."""
+"""A rollout of a checkpoint's policy on a few fresh worlds, for recordings and pictures: the mean action, in the order of a control step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tap's record of a world in one control step: one row of numbers, the meaning of each, and the images that the policy sees."""
+"""The rows of the tap, one for each world and control step: the meaning of each number, and the images that the policy sees."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The live view in Rerun: shapes on links in 3-D, curves, the log. Nothing else of Muster imports Rerun.
+"""The screen of the live view, in Rerun: shapes on links in 3-D, curves, the log. Nothing else of Muster imports Rerun.
 
 On the timeline ``time`` are wall-clock times; of a recording its own ones. ``iteration`` and ``step`` (control steps) are beside it.
 """

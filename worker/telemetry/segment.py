@@ -1,4 +1,4 @@
-"""Memory that a training and one reader on the same machine share: the newest rows of the tap.
+"""A memory segment that a training and one reader on the same machine share: the newest rows of the tap.
 
 A file of 0600 that both map. The writer never waits: it announces how far it is about to write, writes, and announces how far it has
 written. A reader copies what is written, then looks at the first number again, and drops what may have been written over meanwhile.

@@ -1,4 +1,4 @@
-"""The appearance of a task's worlds, without their physics: link frames from joint coordinates, and the shapes on the links."""
+"""The stage of a task's worlds, their appearance without physics: link frames from joint coordinates, and the shapes on the links."""
 
 from __future__ import annotations
 

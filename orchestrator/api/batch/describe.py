@@ -1,4 +1,4 @@
-"""Jobs in AWS Batch's shapes (JobDetail, JobSummary)."""
+"""Descriptions of jobs in AWS Batch's shapes (JobDetail, JobSummary)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``ecsProperties`` of one container: the newer form of ``containerProperties``."""
+"""The ECS form of a container: ``ecsProperties``, the newer form of ``containerProperties``."""
 
 from __future__ import annotations
 

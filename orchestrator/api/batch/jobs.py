@@ -1,4 +1,4 @@
-"""DescribeJobs, ListJobs, TerminateJob(s), CancelJob(s)."""
+"""The Batch API's operations on jobs: DescribeJobs, ListJobs, TerminateJob(s), CancelJob(s)."""
 
 from __future__ import annotations
 

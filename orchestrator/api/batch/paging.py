@@ -1,4 +1,4 @@
-"""Pages of AWS's operations: ``maxResults`` and ``nextToken``."""
+"""Paging in AWS's operations: ``maxResults`` and ``nextToken``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""TagResource, UntagResource, ListTagsForResource."""
+"""The Batch API's operations on tags: TagResource, UntagResource, ListTagsForResource."""
 
 from __future__ import annotations
 

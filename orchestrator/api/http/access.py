@@ -1,4 +1,4 @@
-"""Authentication: by a token, by a key, by a session of the console, or as the controller's own user."""
+"""Access to the server: by a token, by a key, by a session of the console, or as the controller's own user."""
 
 from __future__ import annotations
 

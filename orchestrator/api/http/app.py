@@ -1,4 +1,4 @@
-"""The HTTP application: routes, the guard in front of them, and errors in the shapes that clients expect."""
+"""The HTTP app: its routes, the guard in front of them, and errors in the shapes that clients expect."""
 
 from __future__ import annotations
 

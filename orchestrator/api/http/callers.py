@@ -1,4 +1,4 @@
-"""The user at the other end of a loopback connection, from the kernel's table of sockets.
+"""The caller of a loopback connection: the user at its other end, from the kernel's table of sockets.
 
 A web server that listens on loopback is open to every user of the machine. While no key is demanded, requests are taken from
 processes of the controller's own user alone, whatever they send. Another user's process can't pretend: the table has the user

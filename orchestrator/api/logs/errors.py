@@ -1,4 +1,4 @@
-"""Refusals of CloudWatch Logs."""
+"""Errors of CloudWatch Logs: refusals as the exceptions of AWS's model."""
 
 from __future__ import annotations
 

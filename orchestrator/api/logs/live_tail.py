@@ -1,4 +1,4 @@
-"""A StartLiveTail session: lines as they are written, from every stream that is asked for, also those that begin later."""
+"""The live tail of logs, StartLiveTail: new lines from every stream that is asked for, also from streams that begin later."""
 
 from __future__ import annotations
 

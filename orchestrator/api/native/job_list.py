@@ -1,4 +1,4 @@
-"""The jobs of all queues that the caller may see: found by state, queue and text, with the progress of each training."""
+"""The list of jobs: those of all queues that the caller may see, found by state, queue and text, with the progress of each training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The native API of access keys: list them; make and delete them, while no other machine can reach the server.
+"""The native API's routes for access keys: list them; make and delete them, while no other machine can reach the server.
 
 A key that is made over a network would cross it in clear text, and a stolen key could make its own successors. So a server that listens
 off loopback, or behind a proxy, leaves that to ``muster keys``, run by its own user on its own machine.

@@ -1,4 +1,4 @@
-"""The native API of leagues: create one, race a model in it, enter the race, read the table."""
+"""The native API's routes for leagues: create one, race a model in it, enter the race, read the table."""
 
 from __future__ import annotations
 

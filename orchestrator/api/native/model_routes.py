@@ -1,4 +1,4 @@
-"""The native API of the model registry: list models, register an exported policy."""
+"""The native API's routes for the model registry: list models, register an exported policy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The native API of plans: the processes that a job would start, and whether it could ever start."""
+"""The native API's routes for plans: the processes that a job would start, and whether it could ever start."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Queues and compute as a whole: waiting jobs and their reasons, usage of shares, load of hosts, health of engines."""
+"""An overview of queues and compute: waiting jobs and their reasons, usage of shares, load of hosts, health of engines."""
 
 from __future__ import annotations
 

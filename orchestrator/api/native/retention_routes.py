@@ -1,4 +1,4 @@
-"""The native API of retention: what the rules would take and take, and the runs that a person archives or deletes."""
+"""The native API's routes for retention: what the rules would take and take, and the runs that a person archives or deletes."""
 
 from __future__ import annotations
 

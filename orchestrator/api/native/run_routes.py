@@ -1,4 +1,4 @@
-"""The native API of runs: their description, checkpoints and metrics; resume one, clone one."""
+"""The native API's routes for runs: read their description, checkpoints and metrics; resume one, clone one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The native API of submissions: a spec becomes a job in one request."""
+"""The native API's routes for submissions: a spec becomes a job in one request."""
 
 from __future__ import annotations
 

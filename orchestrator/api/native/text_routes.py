@@ -1,4 +1,4 @@
-"""The native API of the long texts of jobs."""
+"""The native API's routes for the long texts of jobs: keep one, read one."""
 
 from __future__ import annotations
 

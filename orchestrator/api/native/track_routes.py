@@ -1,4 +1,4 @@
-"""The native API of the racer's tracks."""
+"""The native API's routes for the racer's tracks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The native API of webhooks: list the receivers of messages about ended jobs, and test one. For keys with all queues: the operator's."""
+"""The native API's routes for webhooks: list the receivers of messages about ended jobs, and test one. For keys with all queues."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Facts about an account that the ``aws-batch`` engine needs: ``$MUSTER_HOME/aws.json``, written by ``muster aws up``."""
+"""The configuration of the ``aws-batch`` engine: facts about an account in ``$MUSTER_HOME/aws.json``, written by ``muster aws up``."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node of a gang at AWS, by what AWS says of it."""
+"""The status of a gang's node at AWS, by what AWS says of it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Messages between the Ray engine and the driver of a job: files in ``$MUSTER_HOME/ray/<job>/``, and a named pipe.
+"""The folder of a Ray job, ``$MUSTER_HOME/ray/<job>/``: files and a named pipe with messages between the engine and the job's driver.
 
 The driver outlives the controller. Whoever finds a reader at the pipe's other end has found it; what it knows is in its state files.
 """

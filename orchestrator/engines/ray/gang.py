@@ -1,4 +1,4 @@
-"""One attempt on a Ray cluster, as its driver has it: an actor on each node, what was asked of it, and how the node is."""
+"""A gang on a Ray cluster, as its driver has it: an actor on each node, what was asked of it, and how the node is."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An engine of which a test decides everything: how its nodes are, when it hangs, what fails."""
+"""A fake engine, of which a test decides everything: how its nodes are, when it hangs, what fails."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An engine under test, and gangs whose nodes end when the test says so."""
+"""Rigs for tests of an engine: each has the engine, and gangs whose nodes end when the test says so."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The tests that every engine passes by itself, without a controller.
+"""The suite of tests that every engine passes by itself, without a controller.
 
 A test module derives a class whose name begins with ``Test`` from :class:`EngineSuite`, and gives it a fixture ``rig``::
 

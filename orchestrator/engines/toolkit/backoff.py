@@ -1,4 +1,4 @@
-"""Retries at growing intervals; each failure is logged once instead of at every try."""
+"""Backoff between retries: the intervals grow, and each failure is logged once instead of at every try."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The status of a node that has ended, from an exit code and last words."""
+"""The ending of a node as its status, from an exit code and last words."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A node's log that is copied from elsewhere, each line once."""
+"""A copy of a node's log that is elsewhere, each line once."""
 
 from __future__ import annotations
 

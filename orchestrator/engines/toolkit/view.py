@@ -1,4 +1,4 @@
-"""The last answer of a backend that is slow to ask: its value, its age, and why there is no newer one."""
+"""A view of a backend that is slow to ask: its last answer, the answer's age, and why there is no newer one."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""PPO over a gang of ranks, equal to the computation of one rank with all worlds, and made for CUDA graphs.
+"""The fused PPO over a gang of ranks, equal to the computation of one rank with all worlds, and made for CUDA graphs.
 
 Networks are rsl-rl's. Differences from rsl-rl 5.5.1, with reasons:
 

@@ -1,4 +1,4 @@
-"""Interpretations of the actor's outputs: how actions are drawn from them, and the gradient of the loss."""
+"""The heads of the actor: how its outputs are interpreted, how actions are drawn from them, and the gradient of the loss."""
 
 from __future__ import annotations
 

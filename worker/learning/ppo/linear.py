@@ -1,4 +1,4 @@
-"""A multi-layer perceptron with matrix products aligned for tensor cores, and gradients written in place."""
+"""Linear layers of a multi-layer perceptron: matrix products aligned for tensor cores, and gradients written in place."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The data of one iteration of all worlds, in buffers with fixed addresses."""
+"""A rollout: the data of one iteration of all worlds, in buffers with fixed addresses."""
 
 from __future__ import annotations
 

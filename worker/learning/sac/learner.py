@@ -1,4 +1,4 @@
-"""The networks of SAC and one update of them: targets, losses, gradients, steps."""
+"""The learner of SAC: its networks, and one update of them: targets, losses, gradients, steps."""
 
 from __future__ import annotations
 

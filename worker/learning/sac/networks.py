@@ -1,4 +1,4 @@
-"""The policy and the critics."""
+"""The networks of SAC: the policy and the critics."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The newest steps of every world of a rank, on the device."""
+"""The replay buffer: the newest steps of every world of a rank, on the device."""
 
 from __future__ import annotations
 

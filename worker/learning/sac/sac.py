@@ -1,4 +1,4 @@
-"""Soft actor-critic (Haarnoja et al. 2018, arXiv:1801.01290 and arXiv:1812.05905) over a gang of ranks, for thousands of worlds.
+"""SAC, the soft actor-critic (Haarnoja et al. 2018, arXiv:1801.01290, arXiv:1812.05905), over a gang of ranks, for thousands of worlds.
 
 Its speed comes from the methods of FastTD3 (arXiv:2505.22642), FastSAC (arXiv:2512.01996) and FlashSAC (arXiv:2604.04539): thousands of
 worlds and equally large batches, several updates per step, critics that predict a distribution and have layer normalisation, targets from

@@ -1,4 +1,4 @@
-"""A translated reward function as a function of Warp, and its launch over the arrays of all cars."""
+"""A compiled reward function: the Warp function of its translation, and its launch over the arrays of all cars."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A process that runs a learner's function: its limits, how it is called, and what its failures are called.
+"""The confined process that runs a learner's function: its limits, how the function is called, and the messages for its failures.
 
 It imports nothing but the standard library: a process that runs a function starts in a few hundredths of a second.
 """

@@ -1,4 +1,4 @@
-"""The tracks and obstacles of a job, as the samples of its reward function's check have them."""
+"""Courses for the check of a reward function: the tracks of a job with their obstacles, as the samples have them."""
 
 from __future__ import annotations
 

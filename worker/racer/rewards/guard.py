@@ -1,4 +1,4 @@
-"""Checks a reward function before any job starts: its text, its imports and names, and what it does with sample inputs.
+"""The guard of reward functions, before any job starts: it checks the text, imports and names, and the behaviour on sample inputs.
 
 The text's check is against mistakes and carelessness: a determined attacker gets round it. What holds such a one, while the samples
 are tried, is the process's sandbox (:mod:`~worker.racer.rewards.sandbox`).

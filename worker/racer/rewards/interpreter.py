@@ -1,4 +1,4 @@
-"""A process of the pool: calls a reward function for its share of the cars, a step at a time.
+"""An interpreter process of the pool: it calls a reward function for its share of the cars, a step at a time.
 
 Run by its path, in isolated mode. The first line of standard input is a JSON object (``source``, ``file``, ``seconds``, ``memory``,
 ``root``, ``worlds``, ``first``, ``last``, ``tracks``, ``shared``: the descriptor of the shared memory); then each line is a step, or

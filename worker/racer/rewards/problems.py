@@ -1,4 +1,4 @@
-"""Faults of a reward function, in one line each."""
+"""Problems with a reward function, in one line each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The guard's process: tries a reward function on sample inputs, with limits, and says what happened in lines of JSON.
+"""The trial of a reward function, in a process of the guard: on sample inputs, with limits, and reported in lines of JSON.
 
 Run by its path, in isolated mode. It reads one JSON object from standard input: ``source``, ``file``, ``samples``, ``seconds``, ``root``,
 ``anyway``: try it also where the sandbox does not hold.

@@ -1,4 +1,4 @@
-"""A pool of processes that call a reward function for all cars of a step: for functions that are not compiled.
+"""Workers that call a reward function: a pool of processes for all cars of a step, for functions that are not compiled.
 
 Each car has a copy of the file's own, as on AWS, where a process drives one car: what the function remembers is that car's.
 

@@ -1,4 +1,4 @@
-"""Differential inverse kinematics: position targets of joints that move a frame of a robot as actions ask. It measures nothing."""
+"""Differential IK (inverse kinematics): position targets of joints that move a frame of a robot as actions ask. It measures nothing."""
 
 from __future__ import annotations
 

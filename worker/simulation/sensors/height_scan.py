@@ -1,4 +1,4 @@
-"""Heights of the ground around bodies or sites, on a pattern of points."""
+"""A height scan: heights of the ground around bodies or sites, on a pattern of points."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The equations of differential inverse kinematics: Jacobian, normal equations and their solution, on the device."""
+"""Kernels for the equations of differential inverse kinematics: Jacobian, normal equations and their solution, on the device."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An inertial measurement unit: gyro, accelerometer and velocimeter on a body."""
+"""An IMU (inertial measurement unit): gyro, accelerometer and velocimeter on a body."""
 
 from __future__ import annotations
 

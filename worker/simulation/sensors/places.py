@@ -1,4 +1,4 @@
-"""Bodies and sites as frames on bodies, with their poses and velocities."""
+"""Places on robots: bodies and sites as frames on bodies, with their poses and velocities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A term bound to a robot's model: its elements, and the value of each of its parameters in a kernel."""
+"""The binding of a term to a robot's model: its elements, and the value of each of its parameters in a kernel."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Kernels generated from a plan: one for actions; one for rewards, resets and observations (two if observations need bodies or sensors).
+"""The compiler of a plan to kernels: one for actions; one for rewards, resets and observations (two if observations need bodies or sensors).
 
 The source of the kernels is generated and compiled as Warp code under the name of the task. Numbers are read from an array, so that
 the source, and with it the compiled module, does not depend on their values.

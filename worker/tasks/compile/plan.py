@@ -1,4 +1,4 @@
-"""A declaration bound to its robots: the place of every number and the name of every column."""
+"""The plan of a task, a declaration bound to its robots: the place of every number and the name of every column."""
 
 from __future__ import annotations
 

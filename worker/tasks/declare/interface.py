@@ -1,4 +1,4 @@
-"""The meaning of a policy's numbers on a robot, as data: each observation and action with its unit, scale and offset."""
+"""The interface of a policy to a robot, as data: each observation and action with its unit, scale and offset."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The cart-pole, seen through a camera alone."""
+"""The cart-pole from pixels: seen through a camera alone."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A four-legged robot that follows velocity commands on flat ground: forward, sideways and turning."""
+"""A quadruped, which follows velocity commands on flat ground: forward, sideways and turning."""
 
 from __future__ import annotations
 

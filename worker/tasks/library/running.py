@@ -1,4 +1,4 @@
-"""Robots with a torso and hinges that run along +x, with the observations and rewards known from Isaac Gym's Ant and Humanoid."""
+"""Running along +x: robots with a torso and hinges, with the observations and rewards known from Isaac Gym's Ant and Humanoid."""
 
 from __future__ import annotations
 

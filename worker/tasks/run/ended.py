@@ -1,4 +1,4 @@
-"""Records of finished episodes: sums of reward terms and metrics, cause of the end, success."""
+"""Records of ended episodes: sums of reward terms and metrics, cause of the end, success."""
 
 from __future__ import annotations
 

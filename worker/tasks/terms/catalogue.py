@@ -1,4 +1,4 @@
-"""Tables of all terms, with parameters, meanings, and names in mjlab and Isaac Lab, read from signatures and docstrings."""
+"""The catalogue of all terms, with parameters, meanings, and names in mjlab and Isaac Lab, read from signatures and docstrings."""
 
 from __future__ import annotations
 

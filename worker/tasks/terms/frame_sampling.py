@@ -1,4 +1,4 @@
-"""Start frames of episodes in a motion, chosen more often before parts in which robots fall."""
+"""The sampling of start frames in a motion: episodes begin more often before parts in which robots fall."""
 
 from __future__ import annotations
 

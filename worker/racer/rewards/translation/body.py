@@ -1,4 +1,4 @@
-"""The statements of one function in C++: what its variables are follows from all that is assigned to them."""
+"""The body of one function in C++: what its variables are follows from all that is assigned to them."""
 
 from __future__ import annotations
 

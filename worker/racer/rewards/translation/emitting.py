@@ -1,4 +1,4 @@
-"""Lines of C++ that are made of a reward function: temporaries, checks, and what names stand for."""
+"""The C++ lines emitted for a reward function: temporaries, checks, and what names stand for."""
 
 from __future__ import annotations
 

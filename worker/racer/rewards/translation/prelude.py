@@ -1,4 +1,4 @@
-"""Python's arithmetic in C++: checked division, remainders and powers with Python's signs, rounding, indices.
+"""The prelude of the C++ code, Python's arithmetic: checked division, remainders and powers with Python's signs, rounding, indices.
 
 Each entry is a lambda of the generated function. ``at`` is 16 times the line; :data:`ERRORS` has what is added to it.
 """

@@ -1,4 +1,4 @@
-"""State shared by all functions of one file during translation, and the names to which the file itself assigns values."""
+"""The program under translation: state shared by all functions of one file, and the names to which the file assigns values."""
 
 from __future__ import annotations
 

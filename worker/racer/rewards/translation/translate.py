@@ -1,4 +1,4 @@
-"""A whole reward function in C++."""
+"""The translation of a whole reward function to C++."""
 
 from __future__ import annotations
 

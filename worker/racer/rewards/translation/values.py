@@ -1,4 +1,4 @@
-"""Expressions of a reward function during translation: their type and their C++ text."""
+"""The values of a reward function's expressions during translation: their type and their C++ text."""
 
 from __future__ import annotations
 
