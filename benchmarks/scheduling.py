@@ -11,7 +11,7 @@ import time
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
-from orchestrator.scheduling.decide import decide
+from orchestrator.scheduling.decisions import decide
 from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare, Queue, Running, Snapshot, Waiting
 
 HOSTS, GPUS = 16, 8

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Query, Request
 
-from orchestrator.api.http.following import PIECE
+from orchestrator.api.http.answer_streams import PIECE
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.log_stream import positions_of
 from orchestrator.api.native.routes import permitted_job

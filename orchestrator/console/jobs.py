@@ -12,7 +12,7 @@ from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
-from orchestrator.console import words
+from orchestrator.console import formats as words
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render

@@ -8,7 +8,7 @@ from fastapi import Depends, Request, Response
 
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.key_routes import create_key, delete_key, is_writable, list_keys
-from orchestrator.console import words
+from orchestrator.console import formats as words
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Event, Rows, stream
 from orchestrator.console.pages import render

@@ -17,7 +17,7 @@ from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import format_sse_event
 
 from orchestrator.api.http.access import Access
-from orchestrator.api.http.following import Following, looked_patiently
+from orchestrator.api.http.answer_streams import Following, looked_patiently
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.console.pages import session
 from orchestrator.control.store_calls import StoreCalls

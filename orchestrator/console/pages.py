@@ -14,7 +14,8 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import error_response, session_of
 from orchestrator.api.http.requests import actor_of
-from orchestrator.console import assets, words
+from orchestrator.console import assets
+from orchestrator.console import formats as words
 from orchestrator.services.permissions import Actor
 from shared_store import __version__
 

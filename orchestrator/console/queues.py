@@ -12,7 +12,7 @@ from fastapi import Query, Request, Response
 
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.queue_overview import FIRST, overview
-from orchestrator.console import words
+from orchestrator.console import formats as words
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router

@@ -10,7 +10,7 @@ from fastapi import Query, Request, Response
 
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import run_routes
-from orchestrator.console import words
+from orchestrator.console import formats as words
 from orchestrator.console.curves import number
 from orchestrator.console.live import Event, Recent, Rows, stream
 from orchestrator.console.pages import render

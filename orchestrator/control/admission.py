@@ -21,7 +21,7 @@ from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import Reason, named
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Job
-from orchestrator.scheduling.decide import Cancel, Decisions, Preempt, Start, decide
+from orchestrator.scheduling.decisions import Cancel, Decisions, Preempt, Start, decide
 from orchestrator.scheduling.reasons import WaitReport
 from orchestrator.scheduling.snapshot import Leading, Turns
 

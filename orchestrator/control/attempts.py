@@ -63,7 +63,7 @@ from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.log_groups import record_logs
 from orchestrator.persistence.models import Attempt, Job, now
 from orchestrator.persistence.ownership import first_description, record_owner
-from orchestrator.scheduling.decide import Start
+from orchestrator.scheduling.decisions import Start
 from shared_store.volume.epoch import Claim
 
 log = logging.getLogger("muster.controller")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from shared_store.contract.error_text import counted
 
 if TYPE_CHECKING:
-    from worker.tasks.run.telling import Telling
+    from worker.tasks.run.task_report import Telling
 
 MOST = 10
 """Lines at once."""

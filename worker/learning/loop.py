@@ -15,11 +15,11 @@ from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
 from worker.learning.beacon import Beacon
-from worker.learning.begun import as_begun
 from worker.learning.cadence import Cadence
 from worker.learning.completion import complete
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.distributed import Gang
+from worker.learning.earlier_settings import as_begun
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.failures import Failures
 from worker.learning.faults import die, kill_at

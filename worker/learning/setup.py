@@ -32,7 +32,7 @@ from worker.tasks.run.policy_contract import policy_contract, readings_of, robot
 if TYPE_CHECKING:
     from worker.learning.training import Training
     from worker.settings.task import TaskConfig
-    from worker.simulation.robot_judge import Difference
+    from worker.simulation.robot_comparison import Difference
     from worker.tasks.run.task import Task
 
 

@@ -15,13 +15,13 @@ import warp as wp
 from worker.racer.car_arrays import CarArrays, ahead_of, progress_of
 from worker.racer.circuit import BOX, Circuit
 from worker.racer.geometry import project
-from worker.racer.rewards.compiled import RaceArrays
+from worker.racer.rewards.compiled_function import RaceArrays
 from worker.racer.rewards.courses import courses_of
-from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import NUMBER_COLUMNS, OBJECT_COLUMNS
 from worker.racer.rewards.parameters import OBJECT_COUNT as COUNT
 from worker.racer.rewards.parameters import TRACK as TRACK_ROW
 from worker.racer.rewards.reward import RewardFunction, checked, compiled_function
+from worker.racer.rewards.reward_file import RewardFile
 from worker.racer.road import is_open
 from worker.settings.racer import FrontCameraConfig
 from worker.simulation.sensors.sensor import SensorContext

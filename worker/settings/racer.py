@@ -14,8 +14,8 @@ from pydantic.dataclasses import dataclass
 from shared_store.contract.file_fields import kept_file
 from worker.racer.actions import LIDARS, ActionSpace, action_space, read_metadata
 from worker.racer.hyperparameters import KNOWN, plain_settings
-from worker.racer.rewards.kept import RewardFile
 from worker.racer.rewards.parameters import MOST_OBJECTS
+from worker.racer.rewards.reward_file import RewardFile
 from worker.settings.overrides import Refused, expecting, from_mapping
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import (

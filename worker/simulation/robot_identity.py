@@ -13,6 +13,7 @@ import newton
 import numpy as np
 
 from shared_store.contract.policy import RobotModel
+from worker.simulation.robot_comparison import ACTUATOR, ELSEWHERE, SHARED, TENDON, Difference
 from worker.simulation.robot_connections import (
     Ends,
     actuator_ends,
@@ -23,7 +24,6 @@ from worker.simulation.robot_connections import (
     tendon_numbers,
 )
 from worker.simulation.robot_elements import count_of, kind_of, name_of, short, word_of
-from worker.simulation.robot_judge import ACTUATOR, ELSEWHERE, SHARED, TENDON, Difference
 from worker.simulation.robot_values import effort, extent, freedoms, gravity, has_mask, inertia, matrix
 
 Values = dict[str, Any]

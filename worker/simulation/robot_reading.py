@@ -22,11 +22,12 @@ from shared_store.contract.error_text import counted
 from shared_store.contract.policy import RobotModel
 from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
-from worker.simulation import robot_files, robot_judge, robot_mjcf, robot_reference, robot_usd, robot_values
+from worker.simulation import robot_comparison as robot_judge
+from worker.simulation import robot_files, robot_mjcf, robot_reference, robot_usd, robot_values
 from worker.simulation.carriers import keep_inertias
+from worker.simulation.robot_comparison import Comparison, Difference
 from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_identity import identity
-from worker.simulation.robot_judge import Comparison, Difference
 from worker.simulation.robot_reference import Reference
 from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs

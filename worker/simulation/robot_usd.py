@@ -15,8 +15,8 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from worker.simulation import robot_usd_bodies, robot_usd_joints
 from worker.simulation.patterns import check_ignored
+from worker.simulation.robot_comparison import Comparison, Difference, matches
 from worker.simulation.robot_elements import some
-from worker.simulation.robot_judge import Comparison, Difference, matches
 from worker.simulation.robot_usd_stage import RELATIVE, Stage
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from pxr import UsdGeom, UsdPhysics
 
-from worker.simulation.robot_judge import Difference
+from worker.simulation.robot_comparison import Difference
 
 RELATIVE = 1e-5
 """Two values are equal up to this share of the greatest one: USD keeps float32, and angles in degrees."""

@@ -20,12 +20,12 @@ from shared_store.volume.layout import Run
 from shared_store.volume.log_view import LogView
 from shared_store.volume.metrics import history_of
 from worker.settings.errors import UserError
-from worker.telemetry.asking import PATIENCE, Asking
 from worker.telemetry.progress import Activity, loading
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
 from worker.telemetry.rows import Rows
 from worker.telemetry.segment import Segment
+from worker.telemetry.tap_request import PATIENCE, Asking
 
 if TYPE_CHECKING:
     from worker.telemetry.stage import Stage

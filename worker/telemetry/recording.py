@@ -19,8 +19,8 @@ import numpy as np
 from shared_store.contract.error_text import counted
 from worker.settings.errors import UserError
 from worker.telemetry import messages
+from worker.telemetry.intact_records import CHANNELS, LIBRARY, with_checksum
 from worker.telemetry.rows import Rows
-from worker.telemetry.sound import CHANNELS, LIBRARY, with_checksum
 
 if TYPE_CHECKING:
     from mcap.writer import Writer

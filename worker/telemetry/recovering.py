@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from worker.settings.errors import UserError
+from worker.telemetry.intact_records import LIBRARY, SoundRecords, with_checksum
 from worker.telemetry.recording import CHUNK, PARTIAL, writer_to
-from worker.telemetry.sound import LIBRARY, SoundRecords, with_checksum
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,9 @@ import numpy as np
 
 from worker.settings.errors import UserError
 from worker.telemetry import messages
+from worker.telemetry.intact_records import SoundRecords
 from worker.telemetry.recording import PARTIAL
 from worker.telemetry.screen import Look
-from worker.telemetry.sound import SoundRecords
 
 BATCH = 256
 """Control steps that are handed out together."""

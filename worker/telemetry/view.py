@@ -60,8 +60,8 @@ class Training:
     """
 
     def __init__(self, run: Run, job: str, worlds: int, stop: list[int], activity: Activity) -> None:
-        from worker.telemetry.asking import PATIENCE, Asking
         from worker.telemetry.live import stage_of
+        from worker.telemetry.tap_request import PATIENCE, Asking
 
         self._run, self._stop = run, stop
         instead = f"see its newest checkpoint: muster view {run.name}"

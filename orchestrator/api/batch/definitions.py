@@ -7,7 +7,7 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api.batch import fargate, rules
-from orchestrator.api.batch.describe import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
+from orchestrator.api.batch.descriptions import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.models import JobDefinition

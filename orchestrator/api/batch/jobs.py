@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import selectinload
 
-from orchestrator.api.batch.describe import array_properties, describe_damaged, describe_job, node_status, summarize
+from orchestrator.api.batch.descriptions import array_properties, describe_damaged, describe_job, node_status, summarize
 from orchestrator.api.batch.paging import decode, encode, page, page_size
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status

@@ -27,7 +27,7 @@ from starlette.requests import ClientDisconnect, cookie_parser
 from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from orchestrator.api.http import elsewhere
+from orchestrator.api.http import foreign_services as elsewhere
 from orchestrator.api.http.access import Access, actor_of_key
 from orchestrator.api.http.callers import Caller, user_name
 from orchestrator.api.http.limits import Body, RateLimit

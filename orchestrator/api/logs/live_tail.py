@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable, Collection, Iterable, Itera
 from dataclasses import dataclass, field
 from typing import Any
 
-from orchestrator.api.http.following import MEMORY_PIECE, looked, pause
+from orchestrator.api.http.answer_streams import MEMORY_PIECE, looked, pause
 from orchestrator.api.logs import eventstream
 from orchestrator.api.logs.events import Event, is_event, milliseconds
 from orchestrator.api.logs.filter import Matcher

@@ -22,7 +22,7 @@ from starlette.responses import JSONResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from orchestrator.api.batch.service_model import service_model
-from orchestrator.api.http.following import Following
+from orchestrator.api.http.answer_streams import Following
 from orchestrator.api.http.limits import check_size
 from orchestrator.api.logs import filter as log_filter
 from orchestrator.api.logs import groups

@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Sequence
 
-from orchestrator.api.http.following import MEMORY_PIECE, looked, looked_patiently, pause
+from orchestrator.api.http.answer_streams import MEMORY_PIECE, looked, looked_patiently, pause
 from orchestrator.control.log_hub import LogHub, Waker
 from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.store_calls import StoreCalls, StoreSilent

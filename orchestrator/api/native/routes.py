@@ -13,7 +13,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.api.batch.fargate import without_effect
-from orchestrator.api.http.following import PIECE, Following
+from orchestrator.api.http.answer_streams import PIECE, Following
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import (
     job_list,

@@ -1,7 +1,7 @@
 // How long something is past, renewed every second.
 const UNITS = [[86400, "d"], [3600, "h"], [60, "min"]];
 
-/** As `orchestrator.console.words.duration` writes it. */
+/** As `orchestrator.console.formats.duration` writes it. */
 export function duration(seconds) {
   let left = Math.max(0, Math.floor(seconds));
   if (left < 60) return `${left} s`;

@@ -11,7 +11,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from orchestrator.api.http import connections, following
+from orchestrator.api.http import answer_streams as following
+from orchestrator.api.http import connections
 from tests.conftest import Serving, submit_gang, wait_for
 from tests.support.orchestrator.jobs import await_status, serving
 

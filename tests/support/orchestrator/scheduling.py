@@ -8,7 +8,7 @@ from dataclasses import replace
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
-from orchestrator.scheduling.decide import decide
+from orchestrator.scheduling.decisions import decide
 from orchestrator.scheduling.snapshot import (
     ComputeEnvironment,
     FairShare,

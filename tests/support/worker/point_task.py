@@ -14,7 +14,7 @@ import torch
 
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import Randomization
-from worker.tasks.run.telling import Telling
+from worker.tasks.run.task_report import Telling
 
 
 @dataclass(frozen=True)

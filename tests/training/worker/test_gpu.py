@@ -13,7 +13,7 @@ from torch import nn
 
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.host_copies import HostCopies
-from worker.learning.ppo import linear
+from worker.learning.ppo import linear_layers as linear
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.library.cartpole import Cartpole
 from worker.tasks.run.task import Task

@@ -20,8 +20,8 @@ from shared_store.volume.layout import Run
 from worker.learning.reporter import Gate
 from worker.settings.overrides import configured
 from worker.tasks.library.cartpole_pixels import CartpolePixels
-from worker.telemetry.attending import Attending
 from worker.telemetry.live import record
+from worker.telemetry.live_tap import Attending
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
 from worker.telemetry.tap import Reading, Tap
@@ -69,7 +69,7 @@ class Running:
 
 @pytest.fixture
 def running(task: CartpolePixels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
-    monkeypatch.setattr("worker.telemetry.attending.LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.live_tap.LOOK_SECONDS", 0.05)
     running = Running(task, Run(tmp_path / "run"))
     yield running
     running.close()

@@ -18,11 +18,11 @@ from tests.support.waiting import wait_for
 from worker.learning.reporter import Gate
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.asking import answer_of, request_of
-from worker.telemetry.attending import Attending
+from worker.telemetry.live_tap import Attending
 from worker.telemetry.rows import MARKS, Layout, Rows
 from worker.telemetry.segment import Segment
 from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.tap_request import answer_of, request_of
 
 torch.set_num_threads(1)
 SHORT = CartpoleConfig(episode_seconds=0.2)
@@ -160,7 +160,7 @@ def test_memory_of_another_layout_is_refused(tmp_path: Path) -> None:
 def test_a_training_answers_a_request_between_two_iterations_and_stops_when_the_reader_is_gone(
     task: Cartpole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.telemetry.attending.LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.live_tap.LOOK_SECONDS", 0.05)
     run = Run(tmp_path / "run")
     attending = Attending(run, task, Gate())
     assert not attending.attend()
@@ -181,7 +181,7 @@ def test_a_training_answers_a_request_between_two_iterations_and_stops_when_the_
 def test_a_request_from_another_machine_is_answered_with_the_reason(
     task: Cartpole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.telemetry.attending.LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.live_tap.LOOK_SECONDS", 0.05)
     run = Run(tmp_path / "run")
     attending = Attending(run, task, Gate())
     write_json(request_of(run), {"host": "elsewhere", "process": 1, "worlds": 1})

@@ -31,7 +31,7 @@ from worker.settings.cartpole import CartpoleConfig
 from worker.tasks import terms
 from worker.tasks.declare.declaration import Declaration, Metric
 from worker.tasks.library.cartpole import Cartpole
-from worker.tasks.run.ended import Ended
+from worker.tasks.run.episode_records import Ended
 
 GANG = alone()
 

@@ -17,7 +17,7 @@ from torch.distributions import Normal
 from tests.support.worker.loop import alone, iterate, transition_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
-from worker.learning.ppo import linear
+from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.fused import METRICS, PPO
 from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
 from worker.learning.ppo.objective import Objective

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.worker.robot_texts import BOX, HINGE, SECOND, mjcf, read, twins
-from worker.simulation import robot_judge
+from worker.simulation import robot_comparison as robot_judge
 from worker.simulation.robot_view import RobotView
 
 URDF = """<robot name="r"><link name="base"/><link name="a"><inertial><origin xyz=".5 0 0"/><mass value="1"/>

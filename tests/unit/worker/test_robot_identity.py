@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 
 from shared_store.contract.policy_changes import robot_changes
-from worker.simulation import robot_identity, robot_judge
+from worker.simulation import robot_comparison as robot_judge
+from worker.simulation import robot_identity
 from worker.simulation.robot_reading import Reading, Source, read
 
 ARM = """<mujoco><option {option}>{flag}</option><default><joint {joint}/><geom {geom}/></default>

@@ -12,7 +12,7 @@ from newton.solvers import SolverMuJoCo
 
 from tests.support.worker.robot_texts import BOX, HINGE, SECOND, SITE, mjcf, read, twins
 from worker.settings.accepted_changes import CHANGED_ROBOTS
-from worker.simulation import robot_judge
+from worker.simulation import robot_comparison as robot_judge
 from worker.simulation.robot import Robot
 from worker.simulation.robot_identity import identity
 from worker.simulation.robot_view import RobotView

@@ -29,7 +29,8 @@ from worker.learning import moments
 from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.optimizers import load_optimizer
-from worker.learning.ppo import draws, linear, objective
+from worker.learning.ppo import draws, objective
+from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.heads import Categorical, Gaussian, Head
 from worker.learning.ppo.loss import LOSSES, Clipping
@@ -105,7 +106,7 @@ class PPO:
     def _allocate_gradients(self) -> None:
         """One flat buffer: all gradients, then the other shared numbers of a minibatch. The parameters' gradients are views of it.
 
-        Each begins at a multiple of :data:`worker.learning.ppo.linear.ALIGNED`, with zeros between them.
+        Each begins at a multiple of :data:`worker.learning.ppo.linear_layers.ALIGNED`, with zeros between them.
         """
         actor = list(self.actor.parameters())
         shared = set(map(id, actor))  # convolutions may be shared with the actor

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from worker.learning.algorithm import Transition
-from worker.learning.ppo import linear
+from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.models import PixelModel
 
 
@@ -21,7 +21,7 @@ class View:
     Attributes:
         observations: Shape (steps, worlds, *shape), float32, or uint8 of images.
         latents: Input of the network's last part: normalised observations, or features; shape (steps, worlds, features).
-        padded: The same, padded with columns of zeros, see :func:`worker.learning.ppo.linear.padded`.
+        padded: The same, padded with columns of zeros, see :func:`worker.learning.ppo.linear_layers.padded`.
         last: The observation after the last step, shape (worlds, *shape).
     """
 

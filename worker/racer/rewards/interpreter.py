@@ -27,7 +27,8 @@ def main() -> None:
     """Serve steps until standard input ends."""
     asked = json.loads(sys.stdin.buffer.readline())
     sys.path.append(asked["root"])
-    from worker.racer.rewards import confined, namespaces, parameters, problems
+    from worker.racer.rewards import confinement as confined
+    from worker.racer.rewards import namespaces, parameters, problems
 
     warnings.simplefilter("ignore")
     steps, out = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "w")

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from worker.racer.rewards.compiled import failures_of, kernels, race_arrays, warp_function
+from worker.racer.rewards.compiled_function import failures_of, kernels, race_arrays, warp_function
 from worker.racer.rewards.guard import check_source, read_file
 from worker.racer.rewards.parameters import Point
 from worker.racer.rewards.problems import Failure, Problem, RewardFailed, RewardRefused, one_line
@@ -33,7 +33,7 @@ class RewardFunction:
         courses: On which the guard tries it.
 
     Attributes:
-        race: The arrays that a step fills before the call (:class:`worker.racer.rewards.compiled.RaceArrays`).
+        race: The arrays that a step fills before the call (:class:`worker.racer.rewards.compiled_function.RaceArrays`).
         function: The Warp function ``(world: int, race: RaceArrays) -> float``, which a declared task can name as a reward term; None
             where it runs in Python workers.
         reason: Why it is not compiled, one line; empty where it is.

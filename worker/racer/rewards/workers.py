@@ -24,7 +24,7 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError
 
-from worker.racer.rewards.confined import MEMORY
+from worker.racer.rewards.confinement import MEMORY
 from worker.racer.rewards.guard import environment
 from worker.racer.rewards.interpreter import ANEW
 from worker.racer.rewards.parameters import MOST_OBJECTS, NUMBERS, OBJECT_NUMBERS, Point

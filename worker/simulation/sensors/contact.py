@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.contact_rows import ContactRows, contact_rows
+from worker.simulation.sensors.contact_geoms import ContactRows, contact_rows
 from worker.simulation.sensors.places import place_names
 from worker.simulation.sensors.sensor import SensorContext, views_of
 

@@ -23,7 +23,7 @@ from worker.racer.circuit import circuit_of
 from worker.racer.lidar import lidar_sees
 from worker.racer.naming import resolve
 from worker.racer.reward_inputs import RewardInputs
-from worker.racer.rewards.kept import reward_file
+from worker.racer.rewards.reward_file import reward_file
 from worker.racer.scenery import CAR, add_scenery
 from worker.racer.sim_trace import model_documents
 from worker.racer.track import Track

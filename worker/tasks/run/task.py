@@ -31,9 +31,9 @@ from worker.simulation.worlds import Worlds
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
 from worker.tasks.run.checks import assert_replays, check_arguments, noise_of
-from worker.tasks.run.ended import Ended
+from worker.tasks.run.episode_records import Ended
 from worker.tasks.run.saved import check_state, completed
-from worker.tasks.run.telling import Telling
+from worker.tasks.run.task_report import Telling
 
 
 class Task(Telling):
@@ -70,7 +70,7 @@ class Task(Telling):
             float64. They are not part of the state: read and clear them before it is saved.
         mishap: A world that failed and was reset since :meth:`clear_statistics`, and the cause: see :meth:`read_mishap`; shape
             ``(1,)``, int32.
-        ended: The last finished episode of each world, see :class:`worker.tasks.run.ended.Ended`.
+        ended: The last finished episode of each world, see :class:`worker.tasks.run.episode_records.Ended`.
         randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
         captured: Whether :meth:`step` replays a graph; true after construction, which captures one on trial.
     """

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orchestrator.console import words
+from orchestrator.console import formats as words
 from orchestrator.console.curves import columns, curves_of, number
 from orchestrator.console.job_config import code_of, differences
 from orchestrator.console.lineage import Drawing, drawing

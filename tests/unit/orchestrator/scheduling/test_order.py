@@ -7,7 +7,7 @@ import pytest
 from orchestrator.domain.gang import Shape, gang_needs
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
-from orchestrator.scheduling.decide import Start
+from orchestrator.scheduling.decisions import Start
 from orchestrator.scheduling.order import decayed
 from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare
 from tests.support.orchestrator.scheduling import (

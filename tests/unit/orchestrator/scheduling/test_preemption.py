@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from orchestrator.domain.gang import Shape
-from orchestrator.scheduling.decide import Cancel, Preempt
+from orchestrator.scheduling.decisions import Cancel, Preempt
 from orchestrator.scheduling.snapshot import Queue, Running, TimeLimit
 from tests.support.orchestrator.scheduling import (
     CAPACITY,

@@ -13,7 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host
-from orchestrator.scheduling.decide import Decisions, decide
+from orchestrator.scheduling.decisions import Decisions, decide
 from orchestrator.scheduling.order import decayed
 from orchestrator.scheduling.placement import less, place
 from orchestrator.scheduling.snapshot import (

@@ -8,7 +8,7 @@ import pytest
 
 from orchestrator.domain.reasons import Reason, named
 from orchestrator.domain.resources import Resources
-from orchestrator.scheduling.decide import decide
+from orchestrator.scheduling.decisions import decide
 from orchestrator.scheduling.fit import fit
 from orchestrator.scheduling.placement import shortage
 from orchestrator.scheduling.snapshot import ComputeEnvironment, Queue, Snapshot

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orchestrator.scheduling.decide import decide
+from orchestrator.scheduling.decisions import decide
 from orchestrator.scheduling.snapshot import FairShare, Queue, Running, Snapshot, Turns, Waiting
 from tests.support.orchestrator.scheduling import FAIR, NOW, Pass, environment, gang, host, job, line, node, queue
 

@@ -14,7 +14,8 @@ import pytest
 
 from tests.conftest import REPOSITORY
 from tests.support.worker.racing import round_the_guard
-from worker.racer.rewards import confined, guard, parameters, sandbox
+from worker.racer.rewards import confinement as confined
+from worker.racer.rewards import guard, parameters, sandbox
 from worker.racer.rewards.guard import check_source, try_out
 from worker.racer.rewards.problems import RewardFailed
 from worker.racer.rewards.samples import OVAL, oval

@@ -17,7 +17,7 @@ from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
 from worker.racer.rewards import parameters
 from worker.racer.rewards import reward as reward_module
-from worker.racer.rewards.compiled import failures_of, kernels, race_arrays, warp_function
+from worker.racer.rewards.compiled_function import failures_of, kernels, race_arrays, warp_function
 from worker.racer.rewards.problems import Failure, RewardRefused
 from worker.racer.rewards.reward import RewardFunction
 from worker.racer.rewards.samples import Line, oval, random_sample, samples

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from shared_store.contract.error_text import nearest
 from worker.racer.rewards.parameters import BY_NAME
-from worker.racer.rewards.translation.emitting import Emitting
+from worker.racer.rewards.translation.emitter import Emitting
 from worker.racer.rewards.translation.values import (
     C_TYPES,
     Constant,

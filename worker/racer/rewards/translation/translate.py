@@ -18,7 +18,7 @@ class Translated:
     """A reward function as Warp can compile it.
 
     Attributes:
-        snippet: C++ text: the body of a function of ``world`` and ``race`` (:class:`worker.racer.rewards.compiled.RaceArrays`).
+        snippet: C++ text: the body of a function of ``world`` and ``race`` (:class:`worker.racer.rewards.compiled_function.RaceArrays`).
         notes: What was left out, a line each.
     """
 

@@ -1,6 +1,6 @@
-"""A reader's side of a live recording or view: it asks a training of this machine for its tap, and finds the answer.
+"""A reader's request for the tap of a training on this machine, for a live recording or view; and the answer to it.
 
-The training's side is :mod:`worker.telemetry.attending`.
+The training's side is :mod:`worker.telemetry.live_tap`.
 """
 
 from __future__ import annotations

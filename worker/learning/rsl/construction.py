@@ -1,4 +1,4 @@
-"""The building of a configuration's objects by rsl_rl's own functions, with errors in one line."""
+"""The construction of a configuration's objects by rsl_rl's own functions, with errors in one line."""
 
 from __future__ import annotations
 

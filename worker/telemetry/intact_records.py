@@ -1,4 +1,4 @@
-"""Reads a recording that may be cut short or damaged: all records that pass their checksums, in order, and what is lost."""
+"""The intact records of a recording that may be cut short or damaged: all that pass their checksums, in order, and what is lost."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from shared_store.contract.error_text import counted
 from worker.telemetry import messages
-from worker.telemetry.shapes import (
+from worker.telemetry.record_lengths import (
     ATTACHMENT,
     CHUNK,
     CHUNK_BODY,

@@ -1,4 +1,4 @@
-"""Answers to AWS services that are not here (S3, STS, IAM, EC2, ECS …), in each one's own form of an error.
+"""Answers for foreign services, those of AWS that are not here (S3, STS, IAM, EC2, ECS …): each gets an error in its own form.
 
 ``AWS_ENDPOINT_URL`` sends every service to one address. A client that gets an answer of another protocol prints an error that helps
 no one, so each gets one in its own: which service it has reached, and how to send only Batch and CloudWatch Logs here.

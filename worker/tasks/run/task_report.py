@@ -1,4 +1,4 @@
-"""A task's report to the training loop: on its metrics, functions of the user, such as a learner's reward, control steps, shared counts."""
+"""A task's report to the training loop: its metrics, functions of the user such as a learner's reward, control steps, shared counts."""
 
 from __future__ import annotations
 

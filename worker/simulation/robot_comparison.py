@@ -1,4 +1,4 @@
-"""What differs between a robot's file, as MuJoCo compiles it, and the robot that was built of it."""
+"""The comparison of a built robot with its file as MuJoCo compiles it: every value that differs."""
 
 from __future__ import annotations
 

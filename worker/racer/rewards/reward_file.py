@@ -1,4 +1,4 @@
-"""A reward function as a task's configuration has it: the text of its file, which stays with the run. Imported without numpy and torch."""
+"""The file of a reward function in a task's configuration: its text, which stays with the run. Imported without numpy and torch."""
 
 from __future__ import annotations
 

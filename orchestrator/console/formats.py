@@ -1,4 +1,4 @@
-"""Numbers, times and attributes as the pages show them. A job may write anything: a value other than a number is shown as an empty text."""
+"""Formats of numbers, times and attributes on the pages. A job may write anything: a value other than a number is shown as an empty text."""
 
 from __future__ import annotations
 

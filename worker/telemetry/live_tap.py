@@ -1,4 +1,4 @@
-"""The training's side of a live recording or view: a thread that sees a request, and brings the tap's rows to the one who asked.
+"""The live tap of a training: a thread that sees a reader's request, and brings the tap's rows to that reader.
 
 A reader puts ``telemetry/request.json`` into the run's directory and finds the answer in ``telemetry/tap.json``. Both are on one
 machine: the rows go through its memory. Until somebody asks nothing is tapped; from then on the tap fills its ring to the end of the
@@ -18,9 +18,9 @@ from shared_store.volume.layout import Run
 from worker.learning.hooks import Hook
 from worker.learning.reporter import Gate
 from worker.simulation.episodes import WATCHED
-from worker.telemetry.asking import answer_of, is_alive, request_of
 from worker.telemetry.segment import Segment
 from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.tap_request import answer_of, is_alive, request_of
 
 if TYPE_CHECKING:
     from worker.learning.loop import Loop

@@ -1,4 +1,4 @@
-"""Lengths within MCAP records, by which a record is known whose content is damaged or cut off."""
+"""The lengths within MCAP records, by which a record is known whose content is damaged or cut off."""
 
 from __future__ import annotations
 
