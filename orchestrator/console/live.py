@@ -74,11 +74,10 @@ def stream(
     """
     actor = actor_of(request)
     access: Access = request.app.state.access
-    identity = actor
     given = "" if "authorization" in request.headers else session(request)
 
     def admitted() -> bool:
-        return access.still_admits(identity, given)
+        return access.still_admits(actor, given)
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
     calls = controller_of(request).access.followed if stored else None

@@ -17,13 +17,19 @@ from orchestrator.api.http.access import Access
 from orchestrator.console import job, live
 from orchestrator.console.live import Event, Recent, Rows, last_id, stream
 from orchestrator.domain.errors import ClientError
+from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import MetricsWriter, sampled
 
 
 def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
     state = SimpleNamespace(closing=threading.Event(), access=Access())
-    told = SimpleNamespace(headers=headers, query_params=query or {}, app=SimpleNamespace(state=state))
+    told = SimpleNamespace(
+        headers=headers,
+        query_params=query or {},
+        app=SimpleNamespace(state=state),
+        state=SimpleNamespace(actor=CONTROLLER),
+    )
     return cast(Request, told)
 
 
