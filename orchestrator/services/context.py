@@ -9,7 +9,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
-from sqlalchemy import select
+from sqlalchemy import case, select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
@@ -118,14 +118,18 @@ class Context:
         return queue
 
     def definition(self, reference: str) -> JobDefinition:
-        """The active definition of this name (its newest revision), ``name:revision`` or ARN. Raises ClientError."""
+        """The active definition of this ARN, ``name:revision`` or name: the newest revision that the actor has registered, else the newest.
+
+        Raises ClientError.
+        """
         name, _, revision = plain_name(reference, "job-definition").partition(":")
         query = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.status == "ACTIVE")
         if revision:
             if not (revision.isascii() and revision.isdigit() and len(revision) < 10):
                 raise ClientError(f"Job definition {reference[:300]}: the revision must be a number")
             query = query.where(JobDefinition.revision == int(revision))
-        found = self.session.scalars(query.order_by(JobDefinition.revision.desc()).limit(1)).first()
+        others_last = case((JobDefinition.owner == self.actor.name, 0), else_=1)
+        found = self.session.scalars(query.order_by(others_last, JobDefinition.revision.desc()).limit(1)).first()
         if found is None:
             raise ClientError(f"Job definition {reference[:300]} does not exist or is not active")
         return found

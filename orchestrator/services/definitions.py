@@ -1,4 +1,4 @@
-"""Job definitions: whose name it is, and the next revision."""
+"""Job definitions: each revision is its owner's, and several may use one name."""
 
 from __future__ import annotations
 
@@ -34,36 +34,24 @@ def register(
         again: Whether a document that is the newest revision already becomes a revision of its own, as on AWS.
 
     Raises:
-        ClientError: The name is another's, or the store keeps a text not that the document names.
+        ClientError: The store lacks a text that the document names.
         StoreNeeded: Something has to be read of the store first (:func:`.context.with_store`).
     """
-    check_owner(context, name, Operation.REGISTER_JOB_DEFINITION)
+    context.actor.check(Operation.REGISTER_JOB_DEFINITION)
     check_texts(context, gang)
-    query = select(JobDefinition).where(JobDefinition.name == name).order_by(JobDefinition.revision.desc()).limit(1)
-    newest = context.session.scalars(query).first()
-    if (
-        newest
-        and not again
-        and newest.status == "ACTIVE"
-        and newest.document == document
-        and newest.tags == (tags or {})
-    ):
-        return newest
+    of_name = select(JobDefinition).where(JobDefinition.name == name).order_by(JobDefinition.revision.desc()).limit(1)
+    if not again:
+        own = context.session.scalars(of_name.where(JobDefinition.owner == context.actor.name)).first()
+        if own and own.status == "ACTIVE" and own.document == document and own.tags == (tags or {}):
+            return own
+    newest = context.session.scalars(of_name).first()
     added = JobDefinition(
         name=name,
         revision=newest.revision + 1 if newest else 1,
         document=dict(document),
-        # the name stays its owner's when a key with all queues adds a revision
-        owner=(newest.owner if newest else None) or context.actor.name,
+        owner=context.actor.name,
         status="ACTIVE",
         tags=dict(tags or {}),
     )
     context.session.add(added)
     return added
-
-
-def check_owner(context: Context, name: str, operation: Operation) -> None:
-    """Refuse a name that another key has registered: jobs are submitted by the bare name."""
-    caller = context.actor.name
-    foreign = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.owner.is_distinct_from(caller))
-    context.actor.check(operation, *context.session.scalars(foreign.limit(1)))

@@ -10,7 +10,7 @@ from orchestrator.spec.model import Spec, validate
 from shared_store.leagues import League
 
 
-def race_job(league: League, model: str, facts: Mapping[str, Any], queue: str, suffix: str = "") -> Spec:
+def race_job(league: League, model: str, facts: Mapping[str, Any], queue: str) -> Spec:
     """The race of a model by the rules of a league, on a node like those of its training. Raises SpecError.
 
     Args:
@@ -18,10 +18,8 @@ def race_job(league: League, model: str, facts: Mapping[str, Any], queue: str, s
         model: ``NAME@VERSION``.
         facts: Its facts in the registry.
         queue: In which the job waits.
-        suffix: Ends the job's name.
     """
     section = {"checkpoint": facts["iteration"], **league.section()}
-    name = f"race-{league.name}-{model}"[:60] + (f"-{suffix}"[:40] if suffix else "")
-    name = name.replace(".", "-").replace("@", "-")
+    name = f"race-{league.name}-{model}"[:100].replace(".", "-").replace("@", "-")
     document = evaluation_document(str(facts["run"]), facts.get("spec") or {}, section, name, "race")
     return validate({**document, "queue": queue}, f"race of {model}")

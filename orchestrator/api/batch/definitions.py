@@ -14,7 +14,7 @@ from orchestrator.persistence.models import JobDefinition
 from orchestrator.services import permissions
 from orchestrator.services.arns import definition_arn, plain_name
 from orchestrator.services.context import Context
-from orchestrator.services.definitions import check_owner, register
+from orchestrator.services.definitions import register
 from orchestrator.services.permissions import Actor, Operation
 
 _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
@@ -74,9 +74,9 @@ def deregister_job_definition(context: Context, request: dict[str, Any]) -> dict
         raise ClientError(
             f"job definition {request['jobDefinition'][:300]!r}: name it with its revision, NAME:N, or by ARN"
         )
-    check_owner(context, name, Operation.DEREGISTER_JOB_DEFINITION)
     definition = context.session.get(JobDefinition, (name, int(revision)))
     if definition is not None:  # AWS answers the same for one that is not there
+        context.actor.check(Operation.DEREGISTER_JOB_DEFINITION, definition)
         definition.status = "INACTIVE"
     return {}
 

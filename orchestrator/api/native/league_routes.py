@@ -319,11 +319,6 @@ def _racer(actor: Actor, body: RaceRequest) -> str:
     return body.racer
 
 
-def _suffix(actor: Actor) -> str:
-    """Ends the names of a key's races: a job definition belongs to the key that registered it, and each may race any model of a queue."""
-    return "" if actor.queues is None else actor.name.removeprefix("key ")
-
-
 def _submit(
     controller: Controller, actor: Actor, league: League, model: Model, directory: str, idempotency_key: str | None
 ) -> dict[str, Any]:
@@ -341,7 +336,7 @@ def _submit(
                 return submission.answer(earlier)
             queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
             try:
-                spec = race_job(league, model.reference, facts, queue, _suffix(actor))
+                spec = race_job(league, model.reference, facts, queue)
             except SpecError as error:
                 raise ClientError(str(error)) from None
             tags = {LEAGUE_TAG: league.name, MODEL_TAG: model.reference}
