@@ -9,7 +9,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, TypeVar
 
-from sqlalchemy import case, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
@@ -118,18 +118,23 @@ class Context:
         return queue
 
     def definition(self, reference: str) -> JobDefinition:
-        """The active definition of this ARN, ``name:revision`` or name: the newest revision that the actor has registered, else the newest.
+        """The active definition of this ARN, ``name:revision`` or name. Raises ClientError.
 
-        Raises ClientError.
+        A name alone is the newest revision that the actor has registered, else that of the first one who has registered the name:
+        nobody can put a definition of theirs in the place of another's.
         """
         name, _, revision = plain_name(reference, "job-definition").partition(":")
         query = select(JobDefinition).where(JobDefinition.name == name, JobDefinition.status == "ACTIVE")
         if revision:
             if not (revision.isascii() and revision.isdigit() and len(revision) < 10):
                 raise ClientError(f"Job definition {reference[:300]}: the revision must be a number")
-            query = query.where(JobDefinition.revision == int(revision))
-        others_last = case((JobDefinition.owner == self.actor.name, 0), else_=1)
-        found = self.session.scalars(query.order_by(others_last, JobDefinition.revision.desc()).limit(1)).first()
+            found = self.session.scalars(query.where(JobDefinition.revision == int(revision))).first()
+        else:
+            of_name = select(JobDefinition.owner).where(JobDefinition.name == name).order_by(JobDefinition.revision)
+            newest = query.order_by(JobDefinition.revision.desc()).limit(1)
+            owners = self.actor.name, self.session.scalars(of_name.limit(1)).first()
+            of_owners = (newest.where(JobDefinition.owner.is_not_distinct_from(owner)) for owner in owners)
+            found = next((each for query in of_owners if (each := self.session.scalars(query).first())), None)
         if found is None:
             raise ClientError(f"Job definition {reference[:300]} does not exist or is not active")
         return found
