@@ -19,8 +19,9 @@ from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.control.disk import DEFAULT, MinFree
-from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable
+from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable, UsageError
 from orchestrator.domain.retention import rule_of
+from orchestrator.engines.toolkit.environment import INHERIT, PRIVATE
 from orchestrator.home import ControllerRuns, is_temporary, local_url, muster_home
 from orchestrator.spec import file as specfile
 from orchestrator.spec.values import seconds_of
@@ -41,6 +42,18 @@ CpusOption = Annotated[
     float | None, typer.Option(min=0.1, help="CPU cores to allocate; by default all of the machine's.")
 ]
 
+InheritOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--inherit",
+        metavar="NAME",
+        envvar=INHERIT,
+        help="Variable of this environment that jobs on the engines local, ray and slurm get, too, such as WANDB_API_KEY. Repeatable.",
+        show_default=False,
+        show_envvar=False,
+    ),
+]
+
 
 def register(app: typer.Typer) -> None:
     app.command(epilog="Example:  muster run job_specs/cartpole.yaml --set train.iterations=100")(run)
@@ -53,6 +66,7 @@ def run(
     store: StoreOption = None,
     cpus: CpusOption = None,
     engine: EngineOption = None,
+    inherit: InheritOption = None,
 ) -> None:
     """Run a job to its end, with a temporary controller if none is running; exit with its result.
 
@@ -60,6 +74,7 @@ def run(
     """
     loaded = specfile.load(spec, set_, lambda: store_here(store))
     tell(loaded)
+    have_inherited(inherit)
     for name in engine or ():
         check_engine(name)
     with controller(store, cpus, engine or ()) as connect:
@@ -69,6 +84,18 @@ def run(
         job = submit_spec(client, loaded, spec)["jobId"]
         code = see_through(client, job)
     raise typer.Exit(code)
+
+
+def have_inherited(names: Sequence[str] | None) -> None:
+    """Let jobs have these variables of this process. Raises UsageError for a name that no variable can have, and for the controller's own."""
+    for name in names or ():
+        if not name.isidentifier():
+            raise UsageError(f"--inherit {name[:100]}: give the name of a variable, such as WANDB_API_KEY")
+        if name in PRIVATE:
+            raise UsageError(
+                f"--inherit {name}: it is the controller's own; jobs get credentials by secrets: in their YAML"
+            )
+    os.environ[INHERIT] = " ".join(names or ())
 
 
 def see_through(client: Client, job: str, follow: Callable[[Client, str], int] = follow) -> int:
@@ -177,12 +204,14 @@ def serve(
             show_default=False,
         ),
     ] = None,
+    inherit: InheritOption = None,
 ) -> None:
     """Run the controller as a server. Running jobs outlive it; the next controller finds them."""
     from orchestrator.server import Server  # imports dependencies of the controller only
     from orchestrator.service_manager import ServiceManager
 
     manager = ServiceManager()
+    have_inherited(inherit)
     for name in engine or ():
         check_engine(name)
     server = Server(

@@ -1,30 +1,46 @@
-"""The environment that an engine's processes inherit from the controller."""
+"""The environment that an engine's processes have from the controller's own: what programs need to run, and what somebody names."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Collection
 
+INHERIT = "MUSTER_INHERIT"
+"""Variable that names others to inherit, with spaces between: ``muster serve --inherit NAME``."""
 PRIVATE = (
-    *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE"),
+    *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE", INHERIT),
     *("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_SECURITY_TOKEN"),
     *("AWS_CONTAINER_AUTHORIZATION_TOKEN", "RAY_AUTH_TOKEN"),
 )
-"""Variables of the controller that jobs don't get: its credentials for the database and the engines."""
+"""Variables of the controller that jobs don't get, whoever names them: its credentials for the database and the engines."""
+COMMON = (
+    *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "HOSTNAME", "TZ", "LANG", "LANGUAGE", "TERM", "TMPDIR", "PWD"),
+    *("VIRTUAL_ENV", "LD_LIBRARY_PATH", "LD_PRELOAD", "DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM"),
+    *("http_proxy", "https_proxy", "no_proxy", "HTTP_PROXY", "HTTPS_PROXY", "NO_PROXY"),
+    *("SSL_CERT_FILE", "SSL_CERT_DIR", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE"),
+)
+"""Variables without which programs do not find their files, their libraries or the network."""
+FAMILIES = (
+    *("LC_", "XDG_", "PYTHON", "CONDA", "PIP_", "MUSTER_", "WARP_", "NEWTON_", "TORCH", "PYTORCH_", "CUDA_", "NVIDIA_"),
+    *("NCCL_", "GLOO_", "TP_", "OMP_", "MKL_", "OPENBLAS_", "KMP_", "RAY_", "ROS_", "RMW_", "ZENOH_"),
+)
+"""What the names of the settings of interpreters, libraries and Muster itself begin with."""
 
 
 def inherited(
     withheld: Collection[str] = (), prefixes: tuple[str, ...] = (), kept: Collection[str] = ()
 ) -> dict[str, str]:
-    """This process's variables without its private ones.
+    """This process's variables that jobs may have.
 
     Args:
         withheld: Names that are left out, too.
         prefixes: So is what begins with one of these.
-        kept: Names that stay all the same.
+        kept: Names that stay all the same, private or not.
     """
-    return {
-        name: value
-        for name, value in os.environ.items()
-        if name in kept or not (name in PRIVATE or name in withheld or name.startswith(prefixes))
-    }
+    named = set(os.environ.get(INHERIT, "").split()) - {*PRIVATE}
+
+    def is_common(name: str) -> bool:
+        known = name in COMMON or name.startswith(FAMILIES)
+        return known and name not in PRIVATE and name not in withheld and not name.startswith(prefixes)
+
+    return {name: value for name, value in os.environ.items() if name in kept or name in named or is_common(name)}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -36,12 +37,18 @@ from shared_store.volume.log_files import LogWriter
 from tests.conftest import wait_for
 
 
-def test_a_started_process_inherits_all_variables_but_the_controller_s_own(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_started_process_has_the_variables_that_programs_need_and_those_that_are_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     ours = dict.fromkeys(PRIVATE, "secret")
-    monkeypatch.setattr("os.environ", {**ours, "HOME": "/root", "PGHOST": "db", "A": "1"})
-    assert inherited() == {"HOME": "/root", "PGHOST": "db", "A": "1"}
-    assert inherited(["A"], ("PG",), kept=["RAY_AUTH_TOKEN"]) == {"HOME": "/root", "RAY_AUTH_TOKEN": "secret"}
-    assert inherited(["A"], ("PG",), kept=["PGHOST"]) == {"HOME": "/root", "PGHOST": "db"}
+    theirs = {"HOME": "/root", "LC_ALL": "C", "NCCL_DEBUG": "INFO"}
+    monkeypatch.setattr("os.environ", {**ours, **theirs, "HF_TOKEN": "hunter2", "KUBECONFIG": "/k", "PGHOST": "db"})
+    del os.environ["MUSTER_INHERIT"]
+    assert inherited() == theirs
+    assert inherited(["HOME"], ("LC_",), kept=["RAY_AUTH_TOKEN"]) == {"NCCL_DEBUG": "INFO", "RAY_AUTH_TOKEN": "secret"}
+    assert inherited(["HOME"], ("LC_",), kept=["HOME"]) == {"HOME": "/root", "NCCL_DEBUG": "INFO"}
+    os.environ["MUSTER_INHERIT"] = "HF_TOKEN MUSTER_TOKEN NOSUCH"
+    assert inherited() == {**theirs, "HF_TOKEN": "hunter2"}, "and the controller's own never"
 
 
 def test_waiting_ends_when_the_condition_holds_or_the_time_is_over() -> None:
