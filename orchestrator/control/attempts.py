@@ -248,8 +248,8 @@ class Attempts:
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
                 if verdict.start_error is not None:
                     attempt.nodes[job.gang.main].reason = verdict.start_error
-            case Stop(grace):
-                return self._stop(job, attempt, opened, grace)
+            case Stop():
+                return self._stop(job, attempt, opened, instruction)
             case WindUp():
                 return Gone(self.clock.now(), [], "")
         return None
@@ -345,14 +345,13 @@ class Attempts:
             array.started_at = job.started_at
         job.move(Status.RUNNING, reason)
 
-    def _stop(self, job: Job, attempt: Attempt, opened: _Open, grace: float) -> Gone | Delayed | None:
+    def _stop(self, job: Job, attempt: Attempt, opened: _Open, stop: Stop) -> Gone | Delayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
         key = opened.key
         assert attempt.handle is not None
-        if (stopped := self._stops.ask(key, attempt.handle, grace)) is not None:
+        if (stopped := self._stops.ask(key, attempt.handle, stop.grace)) is not None:
             return self._wind_up(job, attempt, opened, stopped)
-        reason = self._stops.reason(key)
-        return Delayed(reason) if reason else None
+        return Delayed(self._stops.reason(key) or stop.waits)
 
     def _wind_up(self, job: Job, attempt: Attempt, opened: _Open, status: GangStatus) -> Gone | Delayed | None:
         """Read what the gang has left, once nothing of it runs any more; None until it is known."""

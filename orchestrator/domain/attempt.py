@@ -216,11 +216,11 @@ def _refused(terms: Terms, event: LaunchRefused) -> Verdict:
 
 def _observed(state: State, seen: Observed) -> Instructions:
     """The tables for a look, one after the other, each from the state that the one before leaves."""
-    done: Instructions = ()
-    for table in (_tell, _judge, _end):
+    was_decided, done = state.verdict is not None, Instructions()
+    for table in (_tell, _judge):
         for instruction in table(state, seen):
             state, done = after(state, instruction), (*done, instruction)
-    return done
+    return *done, *_end(state, seen, is_explained=was_decided and not done)
 
 
 def _tell(state: State, seen: Observed) -> Instructions:
@@ -232,7 +232,7 @@ def _tell(state: State, seen: Observed) -> Instructions:
     runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
     runs = "; ".join(each for each in (runs, unheard, seen.stale) if each)
     if seen.waits:
-        return (Explain(seen.waits),)
+        return (Explain(seen.waits),) if state.verdict is None else ()
     if not state.started:
         return (MarkRunning(runs, seen.moment),)
     return (Explain(runs),) if state.verdict is None else ()
@@ -254,18 +254,21 @@ def _judge(state: State, seen: Observed) -> Instructions:
     return waits if verdict is None else (*waits, Decide(verdict))
 
 
-def _end(state: State, seen: Observed) -> Instructions:
-    """Once the end is decided: the gang is stopped, unless its children may end by themselves."""
+def _end(state: State, seen: Observed, *, is_explained: bool) -> Instructions:
+    """Once the end is decided: the gang is stopped, unless its children may end by themselves.
+
+    ``is_explained``: an earlier look has said why the job ends; the stop may have something to add, which stays.
+    """
     if (verdict := state.verdict) is None:
         return ()
-    waits = f"waits for {seen.stale}" if seen.stale else "its nodes are ending"
-    recorded = Explain(f"{verdict.reason}; {waits}"), Save()
+    waits = f"{verdict.reason}; {f'waits for {seen.stale}' if seen.stale else 'its nodes are ending'}"
     if verdict.ending == Ending.SUCCEEDED and state.terms.options.is_native and None in seen.ends:
         since = seen.moment if state.done_since is None else state.done_since
         if seen.moment - since < FINISHING:
-            return *recorded, AwaitChildren(since)
-    is_broken = verdict.ending in (Ending.FAILED, Ending.FATAL)
-    return *recorded, Stop(_FAILED_GRACE if is_broken else state.terms.grace + _MARGIN)
+            return Explain(waits), Save(), AwaitChildren(since)
+    grace = _FAILED_GRACE if verdict.ending in (Ending.FAILED, Ending.FATAL) else state.terms.grace + _MARGIN
+    recorded = (Save(),) if is_explained else (Explain(waits), Save())
+    return *recorded, Stop(grace, waits)
 
 
 def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:

@@ -89,9 +89,12 @@ class Save:
 
 @dataclass(frozen=True)
 class Stop:
-    """Have the gang stopped, with this grace time [s], unless that is under way: → Delayed, Gone, or nothing yet."""
+    """Have the gang stopped, unless that is under way: → Delayed or Gone."""
 
     grace: float
+    """Seconds from SIGTERM to SIGKILL."""
+    waits: str
+    """Why the job has not ended yet, where the stop itself is under way."""
 
 
 @dataclass(frozen=True)

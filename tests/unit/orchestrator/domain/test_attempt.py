@@ -110,12 +110,12 @@ def ends(verdict: Verdict, grace: float = 35.0, first: Instruction = SAYS_SO) ->
 
 
 def decided(verdict: Verdict, grace: float = 35.0) -> list[Instruction]:
-    return [Decide(verdict), *stops(grace, verdict.reason)]
+    return [Decide(verdict), ending_so(verdict.reason), *stops(grace, verdict.reason)]
 
 
 def stops(grace: float = 35.0, why: str = "why") -> list[Instruction]:
-    """The end is saved before the gang is stopped."""
-    return [ending_so(why), Save(), Stop(grace)]
+    """The end is saved before the gang is stopped; what the stop adds to the reason stays until something else is known."""
+    return [Save(), Stop(grace, f"{why}; its nodes are ending")]
 
 
 def ending_so(reason: str = "why") -> Instruction:
@@ -263,10 +263,15 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     # -- how it is ended
     "an end that is decided stays": (asked(ending(Ending.FAILED)), seen(*MAIN_LAST), stops(5.0)),
     "a preempted gang may save": (ending(Ending.PREEMPTED), seen(), stops()),
-    "one that never ran is stopped, too": (
+    "one that never ran is stopped, too, and its queue says no more why it waits": (
         ending(Ending.PREEMPTED, of=STARTING),
         seen(waits="queued"),
-        [Explain("queued"), *stops()],
+        stops(),
+    ),
+    "one that is seen to run only now says why it ends nevertheless": (
+        ending(Ending.PREEMPTED, of=STARTING),
+        seen(),
+        [MarkRunning(RUNS, T), ending_so(), *stops()],
     ),
     "children of a main node that is done may end": (
         RUNNING,
@@ -287,7 +292,7 @@ RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
     "an old picture is named": (
         ending(Ending.FAILED),
         seen(stale="Slurm to answer"),
-        [Explain("why; waits for Slurm to answer"), Save(), Stop(5.0)],
+        [Save(), Stop(5.0, "why; waits for Slurm to answer")],
     ),
     "a stop that fails is told": (ending(Ending.FAILED), Delayed("not allowed"), [Explain("not allowed")]),
     "so is a store that can't be read": (RUNNING, Delayed("the store is away"), [Explain("the store is away")]),

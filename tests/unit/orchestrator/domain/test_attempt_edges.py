@@ -53,7 +53,8 @@ def test_phases_follow_one_another() -> None:
 def test_a_gang_that_failed_for_good_has_little_to_save() -> None:
     seen = Observed(2000, (None, NodeEnd(1, "exit 1", 1.0)), (None, None))
     decided = Decide(Verdict(Ending.FATAL, "node 1: exit 1", 1))
-    assert [each for each in step(RUNNING, seen) if not isinstance(each, Explain)] == [decided, Save(), Stop(5.0)]
+    stop = Stop(5.0, "node 1: exit 1; its nodes are ending")
+    assert [each for each in step(RUNNING, seen) if not isinstance(each, Explain)] == [decided, Save(), stop]
 
 
 def test_a_look_has_a_silence_for_every_node() -> None:
