@@ -17,7 +17,7 @@ import yaml
 from tensordict import TensorDict
 from torch import nn
 
-import worker.tasks
+import worker.tasks.library
 from shared_store.contract.policy import Action, Command, Contract, Group, State, Term
 from shared_store.volume.bundles import verify
 from shared_store.volume.layout import Run
@@ -331,7 +331,7 @@ def bundle_of(tmp_path: Path, kind: Any) -> tuple[Path, dict[str, Any]]:
 def test_a_robot_of_musters_own_is_in_the_bundle_with_its_licence(tmp_path: Path) -> None:
     target, manifest = bundle_of(tmp_path, Cartpole)
     file = "cartpole.xml"
-    assert (target / "robot" / file).read_bytes() == Path(worker.tasks.__file__).with_name(file).read_bytes()
+    assert (target / "robot" / file).read_bytes() == Path(worker.tasks.library.__file__).with_name(file).read_bytes()
     assert manifest["robot"] == {"source": file, "format": "mjcf", "licence": "Apache-2.0", "file": f"robot/{file}"}
     assert f"robot/{file}" in manifest["files"]  # with its digest
     said = (target / "README.md").read_text()

@@ -167,7 +167,7 @@ def test_what_needs_runs_is_looked_for_again_before_a_run_that_was_cited_can_be_
         look_again()
 
     monkeypatch.setattr(retention.stored, "look_again", looked)
-    controller: Any = SimpleNamespace(retention=retention, run_users=world.users)
+    controller: Any = SimpleNamespace(retention=retention, access=SimpleNamespace(users=world.users))
     with using(controller, "old"):
         assert not taken
     assert taken == [False] and world.users.take("old")

@@ -125,9 +125,3 @@ def test_a_race_is_driven_by_the_league_s_rules_on_one_node_like_those_of_the_tr
             "config": CAR,
         },
     }
-
-
-def test_two_keys_enter_one_model_under_different_names() -> None:
-    names = [race_job(league(), "fast@3", FACTS, "lab", suffix).name for suffix in ("ada", "bob.b")]
-    assert names == ["race-cup-fast-3-ada", "race-cup-fast-3-bob-b"]
-    assert race_job(league("c" * 128), "fast@3", FACTS, "lab", "a" * 128).name == f"race-{'c' * 55}-{'a' * 39}"
