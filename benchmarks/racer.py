@@ -33,13 +33,13 @@ import yaml
 from benchmarks.load import Watch, add_option, told
 from benchmarks.peers.inside.clock import versions
 from benchmarks.training import CUDA, build, device_name, rate, wait
+from racer.settings.task import RacerConfig
 from shared_store.volume.layout import Run
 from worker.evaluation.evaluation import evaluate
 from worker.learning.loop import Loop
 from worker.learning.randomness import held_out_seed
 from worker.learning.setup import build_task
 from worker.settings.errors import UserError
-from worker.settings.racer import RacerConfig
 from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
 from worker.tasks.run.task import Task
 

@@ -22,10 +22,10 @@ import warp as wp
 
 from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, device_name
-from worker.racer.rewards.parameters import row_of
-from worker.racer.rewards.reward import RewardFunction
-from worker.racer.rewards.samples import Line, oval, random_sample
-from worker.racer.rewards.workers import Workers
+from racer.rewards.parameters import row_of
+from racer.rewards.reward import RewardFunction
+from racer.rewards.samples import Line, oval, random_sample
+from racer.rewards.workers import Workers
 
 FUNCTIONS = {
     "heading and speed": """import math

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from shared_store.races import NO_RACER, TRIALS, race_changes, rules_of
+from racer.store.races import NO_RACER, TRIALS, race_changes, rules_of
 from shared_store.volume.outcomes import EX_TEMPFAIL
 from shared_store.volume.run_settings import merged
 from shared_store.volume.texts import beside, keep
@@ -16,7 +16,7 @@ from worker.learning.job import Job, StopRequest, configure, end_startup, run_co
 from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
-    from worker.evaluation.race import Laps
+    from racer.race.trials import Laps
     from worker.tasks.run.task import Task
 
 EPISODES = 100
@@ -122,7 +122,7 @@ def _race_changes(job: Job, task_type: type[Task], ranks: int) -> dict[str, Any]
 
 
 def _laps(task: Any) -> Laps:
-    from worker.evaluation.race import Laps
+    from racer.race.trials import Laps
 
     return Laps(task)
 

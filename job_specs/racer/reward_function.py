@@ -1,5 +1,5 @@
 """A reward function for `job_specs/racer-reward.yaml`, in the form that AWS DeepRacer made known: fast, in the direction of the road,
-and not near its edges. `python -m worker.racer.rewards FILE` says whether one is valid."""
+and not near its edges. `python -m racer.rewards FILE` says whether one is valid."""
 
 import math
 

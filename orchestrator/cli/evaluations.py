@@ -21,7 +21,7 @@ from orchestrator.spec.changes import override
 from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.kept_files import with_files
 from orchestrator.spec.model import Spec, validate
-from shared_store.races import BESIDE, SIM_TRACE
+from racer.store.races import BESIDE, SIM_TRACE
 
 _EXAMPLES = """Examples:  muster evaluate ant-1f2e3d4c@best --episodes 500
 muster evaluate ant-1f2e3d4c@300 --set 'config.randomize.friction=[0.4, 0.6]' --name ant-on-ice

@@ -21,7 +21,6 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import Group, document, filled, groups, races, tasks, written
 from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
-from orchestrator.console.tracks import track_names
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services import permissions
 from orchestrator.services.context import queue_names
@@ -32,6 +31,7 @@ from orchestrator.services.texts import with_texts
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
+from racer.control.track_pages import track_names
 from shared_store.contract.error_text import nearest
 
 router, _stored = page_router(), page_router(stored=True)

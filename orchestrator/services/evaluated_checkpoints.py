@@ -7,9 +7,9 @@ from typing import Any
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import choose, refusal
-from orchestrator.services.racing_tracks import check_names
 from orchestrator.spec.settings import task_config
-from shared_store.races import NO_RACER, key_of, race_changes
+from racer.control.racing_tracks import check_names
+from racer.store.races import NO_RACER, key_of, race_changes
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.run_settings import merged

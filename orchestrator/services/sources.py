@@ -18,7 +18,7 @@ from orchestrator.persistence.ownership import owner_of
 from orchestrator.services.context import Context, archived, permitted_run, release
 from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.permissions import Operation
-from orchestrator.services.racing_tracks import check_tracks
+from racer.control.racing_tracks import check_tracks
 from shared_store.contract.error_text import shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.contents import is_archived

@@ -22,11 +22,11 @@ from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import Actor, JobsOf, Operation
-from orchestrator.services.racing_tracks import check_tracks
 from orchestrator.services.sources import with_teacher
 from orchestrator.services.submission import Submission
 from orchestrator.spec.compile import compile_definition, compile_submission, long_texts, with_environment
 from orchestrator.spec.model import Spec
+from racer.control.racing_tracks import check_tracks
 from shared_store.volume.initial_weights import TeacherCopy
 
 

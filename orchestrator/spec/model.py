@@ -40,8 +40,8 @@ from orchestrator.spec.values import (
     TaskName,
     place_of,
 )
+from racer.store.races import DEFAULTS, TRIALS
 from shared_store.contract.error_text import Refused, explain, kind_of, nearest, path_of, shown
-from shared_store.races import DEFAULTS, TRIALS
 from shared_store.volume.texts import beside
 
 KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")

@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from shared_store import races
+from racer.store import races
 from shared_store.contract.error_text import counted
 from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.volume.layout import LARGEST_DESCRIPTION, Run

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from shared_store import leagues
-from shared_store.leagues import LeagueError
+from racer.store import leagues
+from racer.store.leagues import LeagueError
 from shared_store.volume import models
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile, is_there, read_json

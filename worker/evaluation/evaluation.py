@@ -25,7 +25,7 @@ from worker.learning.report import shown_of
 from worker.tasks.compile.tables import as_json
 
 if TYPE_CHECKING:
-    from worker.evaluation.race import Race
+    from racer.race.trials import Race
     from worker.tasks.run.task import Task
 
 FORMAT = 1

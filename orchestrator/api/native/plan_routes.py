@@ -26,8 +26,8 @@ from orchestrator.services.context import permitted_run
 from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import JobsOf, Operation
-from orchestrator.services.racing_tracks import check_tracks
 from orchestrator.services.sources import sources_of
+from racer.control.racing_tracks import check_tracks
 
 router = APIRouter(route_class=StoreRoute)
 

@@ -18,7 +18,6 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import (
     job_list,
     key_routes,
-    league_routes,
     model_routes,
     plan_routes,
     queue_overview,
@@ -26,7 +25,6 @@ from orchestrator.api.native import (
     run_routes,
     submit_routes,
     text_routes,
-    track_routes,
     webhook_routes,
 )
 from orchestrator.api.native.log_stream import followed, positions_of, stored
@@ -48,6 +46,7 @@ from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import named_definition, queue_names
 from orchestrator.services.damaged_rows import reading
 from orchestrator.services.permissions import Actor, Operation
+from racer.control import league_routes, track_routes
 from shared_store.contract.phases import Phase, phase_in
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared_store import leagues
+from racer.store import leagues
+from racer.tracks.naming import resolve
 from shared_store.volume import models
 from shared_store.volume.bundles import seal
 from shared_store.volume.checkpoints import Checkpoint
@@ -26,7 +27,6 @@ from tests.conftest import Serving, call_muster
 from tests.support.orchestrator.jobs import FOREVER
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 from tests.support.shared_store.leagues import league, race, summary
-from worker.racer.naming import resolve
 
 TRAIN = {"task": "Racer", "worlds": 4, "iterations": 9}
 JOBS = 6

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store import leagues
+from racer.store import leagues
 from shared_store.volume.layout import Store
 from tests.conftest import Serving
 

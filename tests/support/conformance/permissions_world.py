@@ -14,7 +14,7 @@ from orchestrator.keys import KeyStore
 from orchestrator.services.permissions import Operation
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
-from shared_store import leagues
+from racer.store import leagues
 from shared_store.volume import models, texts
 from shared_store.volume.bundles import seal
 from shared_store.volume.checkpoints import Checkpoint

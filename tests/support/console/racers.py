@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from shared_store import leagues
+from racer.store import leagues
 from shared_store.contract.policy import Contract, Group, RobotModel
 from shared_store.volume import models
 from shared_store.volume.bundles import seal

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from shared_store.leagues import League, Rules
-from shared_store.races import race_changes
+from racer.store.leagues import League, Rules
+from racer.store.races import race_changes
 
 RULES = asdict(Rules()) | {"ranking": None}
 CONFIG = race_changes(League("cup", ("oval",), Rules(), 7, "user ada", 1000.0).section())

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from worker.racer.presets import make_preset
-from worker.racer.track import Track
-from worker.settings.racer import RacerConfig
-from worker.tasks.library.racer import Racer
+from racer.car.task import Racer
+from racer.settings.task import RacerConfig
+from racer.tracks.presets import make_preset
+from racer.tracks.track import Track
 
 OVAL = make_preset("oval")
 

@@ -24,6 +24,8 @@ from muster_policy.bundle import open_bundle
 from muster_policy.graph import Node, open_session
 from muster_policy.messages import Messages
 from muster_policy.policy import Policy as NodePolicy
+from racer.car.task import RacerPixels
+from racer.settings.task import FrontCameraConfig, RacerPixelsConfig
 from shared_store.volume.layout import Run
 from tests.conftest import PATIENCE, REPOSITORY, wait_for
 from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
@@ -35,10 +37,8 @@ from worker.learning.algorithms import find_algorithm
 from worker.learning.setup import spaces_of
 from worker.settings.cartpole import CartpolePixelsConfig
 from worker.settings.errors import UserError
-from worker.settings.racer import FrontCameraConfig, RacerPixelsConfig
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.library.cartpole_pixels import CartpolePixels
-from worker.tasks.library.racer import RacerPixels
 from worker.tasks.run.policy_contract import policy_contract
 from worker.tasks.run.task import Task
 

@@ -11,16 +11,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from racer.car.task import Racer
+from racer.rewards import guard, workers
+from racer.rewards.parameters import TRACK
+from racer.rewards.problems import RewardFailed
 from shared_store.volume.layout import Store
 from shared_store.volume.metrics import read_metrics
 from tests.conftest import REPOSITORY
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner
-from worker.racer.rewards import guard, workers
-from worker.racer.rewards.parameters import TRACK
-from worker.racer.rewards.problems import RewardFailed
 from worker.settings.errors import UserError
-from worker.tasks.library.racer import Racer
 
 WORLDS = 4
 USE = "def reward_function(params):\n    now = params['x'] + 0.01 * params['steps']\n"
@@ -52,7 +52,7 @@ FUNCTIONS = {
     "        return -1.0\n",
 }
 ALONE = """import json, os, sys
-from worker.racer.rewards.parameters import parameters_of
+from racer.rewards.parameters import parameters_of
 asked = json.load(sys.stdin)
 for car in asked["cars"]:
     if os.fork() == 0:  # a process for each car, as on AWS

@@ -12,7 +12,13 @@ import numpy as np
 import pytest
 
 from orchestrator.cli.evaluations import _copy
-from shared_store.races import race_changes, rules_of
+from racer.car.sim_trace import SIM_TRACE_COLUMNS
+from racer.car.task import Racer
+from racer.car.training_trace import CARS as MOST_CARS
+from racer.race.trials import Laps
+from racer.settings.task import RacerConfig
+from racer.store.races import race_changes, rules_of
+from racer.tracks.presets import make_preset
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import read_metrics
@@ -20,15 +26,9 @@ from tests.support.worker.loop import alone
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.evaluation.episodes import play
-from worker.evaluation.race import Laps
 from worker.learning.loop import Loop
 from worker.learning.trained import load_policies
-from worker.racer.presets import make_preset
-from worker.racer.sim_trace import SIM_TRACE_COLUMNS
-from worker.racer.training_trace import CARS as MOST_CARS
 from worker.settings.overrides import configured
-from worker.settings.racer import RacerConfig
-from worker.tasks.library.racer import Racer
 
 CARS, STEPS = 4, 24
 SPACE = {"steering_angle": {"low": -30.0, "high": 30.0}, "speed": {"low": 0.5, "high": 2.0}}

@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
-from shared_store import leagues, tracks
-from shared_store.leagues import LeagueError, Rules, StoredLeague, UnknownLeague
-from shared_store.standings import table
+from racer.store import leagues, tracks
+from racer.store.leagues import LeagueError, Rules, StoredLeague, UnknownLeague
+from racer.store.standings import table
 from shared_store.volume.bundles import seal
 from shared_store.volume.files import write_json
 from shared_store.volume.layout import Store
@@ -223,7 +223,7 @@ def test_a_league_is_open_from_its_first_moment_to_its_last_and_the_presets_are_
     assert timed.closed(1000.0) == timed.closed(1999.9) == ""
     assert timed.closed(2000.0) == "league cup closed at 1970-01-01 00:33:20 UTC"
     assert league().closed(0.0) == league().closed(1e12) == ""
-    from worker.racer.presets import PRESETS
+    from racer.tracks.presets import PRESETS
 
     assert tuple(PRESETS) == tracks.PRESETS
 

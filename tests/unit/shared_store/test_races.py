@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from shared_store.races import clock, key_of, race_changes, rules_of
-from shared_store.standings import BadRace, Contender, Race, Ranking, differences, read_race, table
+from racer.store.races import clock, key_of, race_changes, rules_of
+from racer.store.standings import BadRace, Contender, Race, Ranking, differences, read_race, table
 from shared_store.volume.evaluations import lines
 from tests.support.shared_store.leagues import race
 

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 
+from racer.rewards.reward_file import RewardFile, reward_file
 from shared_store.volume import texts
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import digest_of
 from tests.support.refusals import refusal
 from worker.learning.job import Job
-from worker.racer.rewards.reward_file import RewardFile, reward_file
 from worker.settings.errors import UserError
 from worker.settings.overrides import Refused
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from orchestrator.console.tracks import drawn
+from racer.control.track_pages import drawn
 
 RINGS = {
     "inner": [[0.0, 1.0], [4.0, 1.0], [8.0, 1.0]],

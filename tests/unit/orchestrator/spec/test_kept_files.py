@@ -16,7 +16,7 @@ from orchestrator.spec.changes import override
 from orchestrator.spec.compile import compile_definition, long_texts
 from orchestrator.spec.kept_files import changes_with_files, with_files
 from orchestrator.spec.model import validate
-from orchestrator.spec.tracks import ask
+from racer.control.track_orders import ask
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import IN_DEFINITION, LARGEST, digest_of
 from tests.support.refusals import refusal

@@ -9,9 +9,9 @@ import pytest
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.evaluations import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
-from orchestrator.spec.league_races import race_job
 from orchestrator.spec.sections import Evaluation
-from shared_store.leagues import CAR, Rules
+from racer.control.league_races import race_job
+from racer.store.leagues import CAR, Rules
 from shared_store.volume.checkpoints import Checkpoint
 from tests.support.shared_store.leagues import league
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from shared_store import tracks
-from shared_store.tracks import TrackError
+from racer.store import tracks
+from racer.store.tracks import TrackError
 from shared_store.volume.layout import FORMAT, Store, StoreError
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from shared_store import leagues
+from racer.store import leagues
 from shared_store.volume import contents, models, trash
 from shared_store.volume.bundles import seal
 from shared_store.volume.checkpoints import list_checkpoints

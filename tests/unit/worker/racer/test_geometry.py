@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import warp as wp
 
+from racer.car.bicycle import Motion, drive
+from racer.car.car_arrays import overlap
+from racer.tracks import road
+from racer.tracks.arithmetic import sine_cosine
+from racer.tracks.circuit import GAP, bounds, side_by_side
+from racer.tracks.generator import make_random
+from racer.tracks.geometry import advance, degrees, on_road, place_at, project
+from racer.tracks.presets import make_preset
+from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 from tests.support.worker.racing import open_track
-from worker.racer import road
-from worker.racer.arithmetic import sine_cosine
-from worker.racer.bicycle import Motion, drive
-from worker.racer.car_arrays import overlap
-from worker.racer.circuit import GAP, bounds, side_by_side
-from worker.racer.generator import make_random
-from worker.racer.geometry import advance, degrees, on_road, place_at, project
-from worker.racer.presets import make_preset
-from worker.racer.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 
 
 def square(side: float = 4.0, width: float = 1.0) -> Track:

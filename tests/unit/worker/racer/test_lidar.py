@@ -10,10 +10,10 @@ import pytest
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.model import validate
-from worker.racer.car_arrays import CarArrays
-from worker.racer.circuit import BOX
-from worker.settings.racer import LidarConfig, ObstacleConfig, RacerConfig, RacerPixelsAndStateConfig
-from worker.tasks.library.racer import Racer, RacerPixelsAndState
+from racer.car.car_arrays import CarArrays
+from racer.car.task import Racer, RacerPixelsAndState
+from racer.settings.task import LidarConfig, ObstacleConfig, RacerConfig, RacerPixelsAndStateConfig
+from racer.tracks.circuit import BOX
 
 BOXES = tuple(ObstacleConfig(float(along), lane) for along in range(1, 17) for lane in ("inner", "outer"))
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 0, -30)]

@@ -12,21 +12,21 @@ import pytest
 import torch
 from PIL import Image
 
+from racer.car.scenery import _roads, _strip
+from racer.car.task import Racer, RacerPixels
+from racer.rewards.parameters import NUMBER_COLUMNS
+from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
+from racer.tracks.arithmetic import norm
+from racer.tracks.checks import BadTrack
+from racer.tracks.circuit import circuit_of
+from racer.tracks.geometry import advance, on_road, place_at, project
+from racer.tracks.naming import keep
+from racer.tracks.picture import picture_of
+from racer.tracks.route_file import from_bytes, to_bytes
+from racer.tracks.track import Track
 from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, known, open_track, straight
-from worker.racer.arithmetic import norm
-from worker.racer.checks import BadTrack
-from worker.racer.circuit import circuit_of
-from worker.racer.geometry import advance, on_road, place_at, project
-from worker.racer.naming import keep
-from worker.racer.picture import picture_of
-from worker.racer.rewards.parameters import NUMBER_COLUMNS
-from worker.racer.route_file import from_bytes, to_bytes
-from worker.racer.scenery import _roads, _strip
-from worker.racer.track import Track
-from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
-from worker.tasks.library.racer import Racer, RacerPixels
 
 HORSESHOE = open_track()
 END = HORSESHOE.length

@@ -14,20 +14,20 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from shared_store.races import race_changes, rules_of
+from racer.car.resets import COUNTS
+from racer.car.task import Racer, RacerPixels
+from racer.car.trace import COLUMNS
+from racer.race.trials import SIM_TRACE_COLUMNS, Laps, Race
+from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
+from racer.store.races import race_changes, rules_of
+from racer.tracks.geometry import place_at, project
+from racer.tracks.naming import keep
 from shared_store.volume.layout import Run, Store
 from tests.support.worker.loop import alone
 from tests.support.worker.racing import OVAL, counted, known, open_track, racer, straight
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.evaluation import result_of
-from worker.evaluation.race import SIM_TRACE_COLUMNS, Laps, Race
-from worker.racer.geometry import place_at, project
-from worker.racer.naming import keep
-from worker.racer.resets import COUNTS
-from worker.racer.trace import COLUMNS
 from worker.settings.overrides import configured
-from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from worker.tasks.library.racer import Racer, RacerPixels
 
 
 class Driver:

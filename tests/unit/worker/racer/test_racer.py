@@ -11,17 +11,17 @@ import pytest
 import torch
 
 from orchestrator.spec.model import validate
+from racer.car.task import Racer, RacerPixels, RacerPixelsAndState
+from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
+from racer.tracks.generator import make_random
+from racer.tracks.geometry import on_road, place_at
+from racer.tracks.naming import keep
 from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, counted, known, racer, straight
 from worker.learning.job import configure
 from worker.learning.report import figures_of, shown_of
-from worker.racer.generator import make_random
-from worker.racer.geometry import on_road, place_at
-from worker.racer.naming import keep
 from worker.settings.errors import UserError
-from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from worker.tasks.library.racer import Racer, RacerPixels, RacerPixelsAndState
 from worker.tasks.run.policy_contract import policy_contract
 
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 15, 0, -15, -30)]

@@ -11,20 +11,20 @@ from typing import Any
 import numpy as np
 import pytest
 
+from racer.car.courses import courses_for, courses_of
+from racer.rewards.__main__ import main
+from racer.rewards.guard import check_source
+from racer.rewards.parameters import row_of
+from racer.rewards.samples import FINE_OVAL, Line, oval, random_sample
+from racer.settings.task import ObstacleConfig, RewardFile
+from racer.tracks.circuit import circuit_of
+from racer.tracks.geometry import on_road, project
+from racer.tracks.naming import keep, resolve
+from racer.tracks.presets import make_preset
+from racer.tracks.track import Track
 from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.racing import OVAL, open_track, racer
-from worker.racer.circuit import circuit_of
-from worker.racer.geometry import on_road, project
-from worker.racer.naming import keep, resolve
-from worker.racer.presets import make_preset
-from worker.racer.rewards.__main__ import main
-from worker.racer.rewards.courses import courses_for, courses_of
-from worker.racer.rewards.guard import check_source
-from worker.racer.rewards.parameters import row_of
-from worker.racer.rewards.samples import FINE_OVAL, Line, oval, random_sample
-from worker.racer.track import Track
-from worker.settings.racer import ObstacleConfig, RewardFile
 
 NEXT = """def reward_function(params):
     _, ahead = params["closest_objects"]

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import pytest
 
+from racer.rewards import guard
+from racer.rewards.__main__ import main
+from racer.rewards.guard import check, check_source
+from racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of, table
+from racer.rewards.problems import KINDS
+from racer.rewards.samples import Line, oval, samples
+from racer.rewards.translation import translate
 from tests.conftest import REPOSITORY
 from tests.support.worker.racing import round_the_guard
-from worker.racer.rewards import guard
-from worker.racer.rewards.__main__ import main
-from worker.racer.rewards.guard import check, check_source
-from worker.racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of, table
-from worker.racer.rewards.problems import KINDS
-from worker.racer.rewards.samples import Line, oval, samples
-from worker.racer.rewards.translation import translate
 
 HEAD = "def reward_function(params):\n    "
 

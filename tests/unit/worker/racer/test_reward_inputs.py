@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 import torch
 
+from racer.car.task import Racer, RacerPixels
+from racer.rewards import parameters
+from racer.rewards.problems import Failure, RewardFailed
+from racer.rewards.samples import oval, samples
+from racer.rewards.workers import Workers
+from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
+from racer.tracks.geometry import on_road, project
 from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 from tests.support.worker.racing import known, racer, round_the_guard
-from worker.racer.geometry import on_road, project
-from worker.racer.rewards import parameters
-from worker.racer.rewards.problems import Failure, RewardFailed
-from worker.racer.rewards.samples import oval, samples
-from worker.racer.rewards.workers import Workers
-from worker.settings.racer import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
-from worker.tasks.library.racer import Racer, RacerPixels
 
 BOXES = (ObstacleConfig(1.5, "inner"), ObstacleConfig(6.0, "outer"), ObstacleConfig(9.0, "center"))
 STEER = """

@@ -12,14 +12,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from racer.rewards import confinement as confined
+from racer.rewards import guard, parameters, sandbox
+from racer.rewards.guard import check_source, try_out
+from racer.rewards.problems import RewardFailed
+from racer.rewards.samples import OVAL, oval
+from racer.rewards.workers import Workers
 from tests.conftest import REPOSITORY
 from tests.support.worker.racing import round_the_guard
-from worker.racer.rewards import confinement as confined
-from worker.racer.rewards import guard, parameters, sandbox
-from worker.racer.rewards.guard import check_source, try_out
-from worker.racer.rewards.problems import RewardFailed
-from worker.racer.rewards.samples import OVAL, oval
-from worker.racer.rewards.workers import Workers
 
 MACHINE = os.uname().machine
 pytestmark = pytest.mark.skipif(MACHINE not in sandbox.MACHINES, reason="no list of this processor's system calls")
@@ -366,7 +366,7 @@ def test_on_a_kernel_without_the_means_a_file_is_not_run_and_one_line_says_so(
     file = tmp_path / "r.py"
     file.write_text("print(1 / 0)\ndef reward_function(params):\n    return 1.0\n")
     kernel = [sys.executable, "-m", "tests.support.worker.kernel", calls]
-    command = [sys.executable, "-m", "worker.racer.rewards", str(file)]
+    command = [sys.executable, "-m", "racer.rewards", str(file)]
     ended = subprocess.run([*kernel, *command], cwd=REPOSITORY, capture_output=True, text=True, check=False)
     assert ended.stderr == f"{file}: no sandbox, since {why}; it was not run: the job's own nodes try it\n"
     assert ended.returncode == 0 and ended.stdout.startswith(f"{file}: valid, compiled to the device\n")

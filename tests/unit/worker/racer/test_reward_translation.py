@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 import warp as wp
 
+from racer.rewards import parameters
+from racer.rewards import reward as reward_module
+from racer.rewards.compiled_function import failures_of, kernels, race_arrays, warp_function
+from racer.rewards.problems import Failure, RewardRefused
+from racer.rewards.reward import RewardFunction
+from racer.rewards.samples import Line, oval, random_sample, samples
+from racer.rewards.translation import Outside, Translated, translate
 from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
-from worker.racer.rewards import parameters
-from worker.racer.rewards import reward as reward_module
-from worker.racer.rewards.compiled_function import failures_of, kernels, race_arrays, warp_function
-from worker.racer.rewards.problems import Failure, RewardRefused
-from worker.racer.rewards.reward import RewardFunction
-from worker.racer.rewards.samples import Line, oval, random_sample, samples
-from worker.racer.rewards.translation import Outside, Translated, translate
 
 VALUES = (-2.5, -2.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.5, 7.0, 1e6)
 """Of x; y is the same list backwards."""
@@ -293,7 +293,7 @@ def test_both_ways_of_running_a_function_give_the_same_rewards_and_failures() ->
 
 def test_a_function_compiles_in_a_process_that_has_used_no_warp_yet() -> None:
     code = (
-        "from worker.racer.rewards.reward import RewardFunction as F; from worker.racer.rewards.samples import oval\n"
+        "from racer.rewards.reward import RewardFunction as F; from racer.rewards.samples import oval\n"
         f"made = F({SOURCE!r}, [oval()], 1); print('reason', made.reason, made.function is not None)"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=REPOSITORY)

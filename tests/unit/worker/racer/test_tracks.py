@@ -15,17 +15,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from shared_store.tracks import LARGEST
+from racer.store.tracks import LARGEST
+from racer.tracks.checks import BadTrack, area_of, inside
+from racer.tracks.generator import make_random
+from racer.tracks.geometry import on_road
+from racer.tracks.naming import keep, resolve
+from racer.tracks.picture import picture_of
+from racer.tracks.presets import PRESETS, make_preset
+from racer.tracks.route_file import from_bytes, read_file, to_bytes
+from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
-from worker.racer.checks import BadTrack, area_of, inside
-from worker.racer.generator import make_random
-from worker.racer.geometry import on_road
-from worker.racer.naming import keep, resolve
-from worker.racer.picture import picture_of
-from worker.racer.presets import PRESETS, make_preset
-from worker.racer.route_file import from_bytes, read_file, to_bytes
-from worker.racer.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 
 
 def ring(radius: float, count: int = 100) -> np.ndarray:

@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from shared_store import tracks as stored
+from racer.car.scenery import _roads, _strip
+from racer.car.task import Racer
+from racer.settings.task import ObstacleConfig, RacerConfig
+from racer.store import tracks as stored
+from racer.tracks import __main__ as command
+from racer.tracks.arithmetic import norm
+from racer.tracks.circuit import circuit_of
+from racer.tracks.generator import make_random
+from racer.tracks.geometry import advance, on_road, place_at, project
+from racer.tracks.naming import keep, resolve
+from racer.tracks.presets import PRESETS, make_preset
+from racer.tracks.road import road_arrays
+from racer.tracks.route_file import from_bytes, to_bytes
+from racer.tracks.track import Track
 from shared_store.volume.layout import Store
 from tests.support.worker.racing import known
-from worker.racer import __main__ as command
-from worker.racer.arithmetic import norm
-from worker.racer.circuit import circuit_of
-from worker.racer.generator import make_random
-from worker.racer.geometry import advance, on_road, place_at, project
-from worker.racer.naming import keep, resolve
-from worker.racer.presets import PRESETS, make_preset
-from worker.racer.road import road_arrays
-from worker.racer.route_file import from_bytes, to_bytes
-from worker.racer.scenery import _roads, _strip
-from worker.racer.track import Track
-from worker.settings.racer import ObstacleConfig, RacerConfig
-from worker.tasks.library.racer import Racer
 
 
 def ring(radius: float, turned: float = 0.0, count: int = 120) -> np.ndarray:

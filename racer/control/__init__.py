@@ -1,0 +1,1 @@
+"""The racer in the control plane: routes, commands, pages, and the section ``race`` of a job."""

@@ -1,0 +1,78 @@
+"""The table of a league: as cells, as CSV, and as a picture drawn without a display."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from orchestrator.domain.errors import UsageError
+from racer.store.races import clock
+from racer.store.standings import Row
+from shared_store.volume.files import write_atomic
+
+COLUMNS = ("RANK", "ENTRY", "RACER", "MODEL", "TIME", "BEST LAP", "LAPS", "OFF-TRACKS", "CRASHES", "RESETS", "STATUS")
+_NUMBERS = ("off_tracks", "crashes", "resets")
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """A row of the table as text, one cell for each of :data:`COLUMNS`."""
+    laps = "-" if row["laps"] is None else f"{row['completed']} of {row['laps']}"
+    counts = ["-" if row[key] is None else str(row[key]) for key in _NUMBERS]
+    told = {"ranked": "ranked", "altered": row["reason"]}
+    status = told.get(row["status"]) or f"{row['status']}: {row['reason']}"
+    return [
+        str(row["rank"] or "-"),
+        str(row["entry"]),
+        row["racer"],
+        row["model"],
+        clock(row["time"]),
+        clock(row["best_lap"]),
+        laps,
+        *counts,
+        status,
+    ]
+
+
+def write(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Write the table to ``path``, a .csv (times in seconds) or a .png. Raises UsageError if it can't."""
+    try:
+        write_atomic(path.absolute(), _csv(rows) if path.suffix == ".csv" else _picture(league, rows))
+    except ImportError:
+        raise UsageError(
+            f"-o {path}: a picture needs matplotlib, which this environment lacks: pip install 'muster[plot]'; .csv needs nothing"
+        ) from None
+    except OSError as error:
+        raise UsageError(f"-o {path}: {error.strerror or error}") from None
+
+
+def _csv(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(Row.__dataclass_fields__), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()
+
+
+def _picture(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    shown = [[*cells(row)[:-1], row["status"]] for row in rows]
+    figure = Figure(figsize=(11, 1.2 + 0.3 * len(shown)), dpi=120)
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    axes.set_axis_off()
+    rules = league["rules"]
+    title = f"{league['name']}: {rules['laps']} x {', '.join(league['track'])}, ranked by {rules['ranking']}"
+    axes.set_title(title.replace("$", r"\$"), loc="left")
+    texts = [[each.replace("$", r"\$") for each in row] for row in (shown or [["-"] * len(COLUMNS)])]
+    table = axes.table(cellText=texts, colLabels=COLUMNS, cellLoc="left", loc="upper left", edges="horizontal")
+    table.auto_set_font_size(False)
+    table.set_fontsize(9)
+    table.auto_set_column_width(range(len(COLUMNS)))
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", bbox_inches="tight")
+    return buffer.getvalue()

@@ -1,0 +1,176 @@
+"""``muster tracks``: the racer's tracks."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.misuse import make_group
+from orchestrator.cli.recordings import OverwriteOption, check_output
+from orchestrator.cli.serving import StoreOption, controller
+from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.domain.errors import ServerError, UsageError
+from racer.control.track_orders import ask
+
+TrackArgument = Annotated[
+    str, typer.Argument(metavar="NAME", help="A preset (oval), a seed (random:7), or a track of the store.")
+]
+OutOption = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Write the track as a picture (.png) or as data (.npy).", show_default=False),
+]
+NewName = Annotated[str, typer.Option("--name", help="Name of the track.")]
+
+_EXAMPLES = """Examples:  muster tracks show random:7 -o track.png
+muster tracks make hills --seed 7 --length 45   then   muster tracks list"""
+
+
+def register(app: typer.Typer) -> None:
+    group = make_group(
+        "Manage the racer's tracks: list, show, make, import. Tracks are immutable.",
+        _EXAMPLES,
+    )
+    group.command("list", epilog="Example:  muster tracks list --json")(list_tracks)
+    group.command("show", epilog="Example:  muster tracks show chicane -o chicane.png")(show)
+    group.command("make", epilog="Example:  muster tracks make hills --seed 7 --length 45 --width 1.2 -o hills.png")(
+        make
+    )
+    group.command("import", epilog="Example:  muster tracks import reinvent_base.npy --name reinvent")(import_file)
+    app.add_typer(group, name="tracks")
+
+
+def list_tracks(store: StoreOption = None, as_json: JsonOption = False) -> None:
+    """List the presets and the tracks of the store, with their measures."""
+    found = _ask({"action": "list"}, store)
+    if as_json:
+        echo_json(found, indent=1)
+        return
+    table = Table(box=None, pad_edge=False)
+    for column in ("TRACK", "LENGTH", "WIDTH", "RADIUS", "DIRECTION", "WAYPOINTS", "FROM"):
+        table.add_column(column, no_wrap=True)
+    for track in found:
+        if "problem" in track:
+            table.add_row(track["name"], *["-"] * 5, track["problem"])
+            continue
+        measures = (f"{track['length']:.2f} m", _width(track), f"{track['least_radius']:.2f} m", track["direction"])
+        table.add_row(track["name"], *measures, str(track["waypoints"]), _origin(track["origin"]))
+    print_cut(table)
+
+
+def show(
+    track: TrackArgument,
+    output: OutOption = None,
+    overwrite: OverwriteOption = False,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show a track's measures; with -o draw it as a picture, or write it as a file for other tools."""
+    _tell(_ask({"action": "show", "name": track}, store, output, overwrite), output, as_json)
+
+
+def make(
+    name: Annotated[str, typer.Argument(help="Name of the track.")],
+    preset: Annotated[
+        str | None, typer.Option(help="Exact straights and arcs: oval, rounded-rectangle, chicane.")
+    ] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of a random closed curve.")] = None,
+    length: Annotated[
+        float | None, typer.Option(help="Length of the centre line, in metres; by default the preset's own, or 30.")
+    ] = None,
+    width: Annotated[float | None, typer.Option(help="Width of the road, in metres; 1 by default.")] = None,
+    spacing: Annotated[float | None, typer.Option(help="Spacing of waypoints, in metres; 0.15 by default.")] = None,
+    roughness: Annotated[
+        float | None, typer.Option(help="Variation of a random curve: 0 is a circle, 1 is wild; 0.7 by default.")
+    ] = None,
+    least_radius: Annotated[
+        float | None,
+        typer.Option(help="Least radius of a random curve, in metres; 0.75 by default.", show_default=False),
+    ] = None,
+    direction: Annotated[
+        str | None, typer.Option(help="counter-clockwise (the default) or clockwise.", show_default=False)
+    ] = None,
+    output: OutOption = None,
+    overwrite: OverwriteOption = False,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Make a track from a preset or a seed, and store it."""
+    if (preset is None) == (seed is None):
+        raise UsageError("give one of --preset (oval, rounded-rectangle, chicane) and --seed N")
+    given = {"length": length, "width": width, "spacing": spacing, "direction": direction}
+    drawn = {"roughness": roughness, "least_radius": least_radius}
+    for option, value in drawn.items():
+        if preset is not None and value is not None:
+            raise UsageError(
+                f"--{option.replace('_', '-')} belongs to --seed; a preset's curves follow from its length"
+            )
+    measures = {key: value for key, value in {**given, **drawn}.items() if value is not None}
+    order = {"action": "make", "name": name, "preset": preset, "seed": seed, "measures": measures}
+    _tell(_ask(order, store, output, overwrite), output, as_json)
+
+
+def import_file(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", help="An .npy file of the shape (N, 6): centre, inner and outer x and y, in metres."
+        ),
+    ],
+    name: NewName,
+    output: OutOption = None,
+    overwrite: OverwriteOption = False,
+    store: StoreOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Check a track in DeepRacer's community format, and store it."""
+    order = {"action": "import", "file": str(file.absolute()), "name": name}
+    _tell(_ask(order, store, output, overwrite), output, as_json)
+
+
+def _ask(order: Mapping[str, Any], store: str | None, output: Path | None = None, overwrite: bool = False) -> Any:
+    """Have another process do it, in the controller's store. Raises UsageError, ServerError."""
+    if output is not None:
+        check_output(output, overwrite, ".png", ".npy")
+    with controller(store, None) as connect:
+        place = connect().get("/api/capacity")["store"]
+    if not Path(place).is_dir():
+        raise ServerError(f"the controller's store, {place}, is not on this machine; run the command where it is")
+    return ask({**order, "store": place, "output": str(output.absolute()) if output else None})
+
+
+def _tell(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None:
+    if as_json:
+        echo_json(track, indent=1)
+        return
+    echo(f"{track['name']}: {track['length']:.2f} m long, {_width(track)} wide, {track['direction']}")
+    echo(f"  tightest:   a radius of {track['least_radius']:.2f} m")
+    steps = track["waypoints"] - (not track["closed"])
+    echo(f"  waypoints:  {track['waypoints']}, {track['length'] / steps:.3f} m apart")
+    if origin := track.get("origin"):
+        echo(f"  from:       {_origin(origin)}")
+        for note in origin.get("notes") or ():
+            echo(f"  mended:     {note}")
+    if created := track.get("created"):
+        echo(f"  kept:       {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(created))}")
+    echo(f"  digest:     {track['digest']}")
+    if path := track.get("path"):
+        echo(f"  lies in:    {path}")
+    if output is not None:
+        echo(f"written: {output}")
+
+
+def _width(track: Mapping[str, Any]) -> str:
+    least, most = track["width"]
+    return f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m"
+
+
+def _origin(origin: Mapping[str, Any]) -> str:
+    """The origin of a track, then its settings."""
+    keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
+    return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)

@@ -1,0 +1,40 @@
+"""Tracks of the racer, by a process of the worker's: this package never imports their code."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Mapping
+from importlib.util import find_spec
+from typing import Any
+
+from orchestrator.domain.errors import ServerError, UsageError
+
+_PATIENCE = 120.0
+"""Seconds that an order may take."""
+
+
+def ask(order: Mapping[str, Any]) -> Any:
+    """Give an order to :mod:`racer.tracks`, and return its answer.
+
+    Args:
+        order: ``action``, ``store`` (its path), ``output`` (a path, or None), and what the action takes.
+
+    Raises:
+        UsageError: The order can't be carried out; one line.
+        ServerError: The worker is not installed here, or failed.
+    """
+    if find_spec("numpy") is None:
+        raise ServerError("tracks need numpy, which this environment lacks: pip install 'muster[worker]'")
+    command = [sys.executable, "-P", "-m", "racer.tracks", json.dumps(order)]
+    try:
+        asked = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_PATIENCE)
+    except subprocess.TimeoutExpired:
+        raise ServerError(f"racer.tracks has not answered within {_PATIENCE:.0f} s; does the store answer?") from None
+    said = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
+    if asked.returncode == 2:
+        raise UsageError(said[-1])
+    if asked.returncode:
+        raise ServerError(f"racer.tracks: {said[-1]}")
+    return json.loads(asked.stdout)

@@ -1,0 +1,1 @@
+"""Tracks: their geometry, presets, files and pictures."""

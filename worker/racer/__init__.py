@@ -1,1 +1,0 @@
-"""The racer: tracks, what a car on one observes, and reward functions."""

@@ -1,5 +1,0 @@
-"""Reward functions in DeepRacer's form, ``def reward_function(params) -> float``: checked, and run for all cars of a step at once.
-
-:mod:`~worker.racer.rewards.parameters` has the contract, :mod:`~worker.racer.rewards.guard` checks a file before any job starts, and
-:class:`worker.racer.rewards.reward.RewardFunction` runs it: compiled to the device where it can be translated, else in processes.
-"""
