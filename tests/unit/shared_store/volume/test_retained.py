@@ -197,8 +197,8 @@ def test_what_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> 
     write(store.models / "ant" / "1" / "model.json", "{")
     (store.models / "bee" / "1").mkdir(parents=True)
     leagues.create(store, league())
-    write(store.leagues / "cup" / "entries" / "1" / "entry.json", "[]")
-    (store.leagues / "cup" / "entries" / "2").mkdir()
+    write(store.path / "leagues" / "cup" / "entries" / "1" / "entry.json", "[]")
+    (store.path / "leagues" / "cup" / "entries" / "2").mkdir()
     found, unreadable = references(store)
     assert found == []
     for part in ("run source", "model ant@1", "model bee@1", "entry 1 of league cup", "entry 2 of league cup"):
@@ -215,10 +215,10 @@ def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
     for name in ("ant", "bee"):
         write_json(store.models / name / "1" / "model.json", {"run": "source"})
     leagues.create(store, league())
-    write(store.leagues / "cup" / "entries" / "1" / "entry.json", "{}")
+    write(store.path / "leagues" / "cup" / "entries" / "1" / "entry.json", "{}")
     closed = (
         store.models / "ant",
-        store.leagues / "cup" / "entries",
+        store.path / "leagues" / "cup" / "entries",
         store.run("hidden").path,
         store.run("pupil").path / "teachers",
     )
