@@ -229,7 +229,7 @@ def _groups(request: Request, task: str) -> list[Group]:
     if task not in tasks():
         raise ClientError(f"no task is called {task[:100]!r}; {nearest(task, list(tasks()))}", 404)
     with controller_of(request).database.session() as session:
-        return groups(request, task, queue_names(session, actor))
+        return groups(task, queue_names(session, actor))
 
 
 def _wizard(
@@ -237,6 +237,8 @@ def _wizard(
 ) -> Response:
     actor = actor_of(request)
     text = written(document(task, found))
+    form = form_of(task)
+    there, missing = form.names(request) if form else ([], "")
     names = [each.name for group in found for each in group.fields]
     return render(
         request,
@@ -246,6 +248,8 @@ def _wizard(
         about=tasks()[task],
         groups=found,
         text=text,
+        names=there,
+        missing=missing,
         problem=problem,
         wrong_name=_nearest_field(problem.key, names) if problem else "",
         tries=actor.queues is None,

@@ -40,8 +40,8 @@ class Field:
     name: str
     """The key path in the YAML."""
     kind: Literal["text", "value", "choice", "code", "names"] = "value"
-    """``text``: as it stands; ``value``: read as YAML; ``choice``: one of the options; ``code``: a text of several lines; ``names``: some of
-    the options, or other names, one a line."""
+    """``text``: as it stands; ``value``: read as YAML; ``choice``: one of the options; ``code``: a text of several lines; ``names``: names,
+    one a line."""
     options: tuple[str, ...] = ()
     value: str = ""
     placeholder: str = ""
@@ -53,8 +53,6 @@ class Field:
     """The name of the file whose text a ``code`` is; empty where it is a value of YAML."""
     picture: str = ""
     """Address of a name's picture, in which ``{}`` is the name."""
-    missing: str = ""
-    """Why there are no names."""
 
     @property
     def label(self) -> str:
@@ -81,10 +79,12 @@ class TaskForm:
     """Of these tasks, where one is chosen."""
     includes: Callable[[str], bool]
     """Whether a task is one of them."""
-    groups: Callable[[Request, str], list[Group]]
-    """Further fields, which stand before those of the task's schema."""
+    groups: Callable[[str], list[Group]]
+    """Further fields of a task, which stand before those of its schema."""
     keys: frozenset[str]
     """The keys of the task's configuration that they give."""
+    names: Callable[[Request], tuple[list[str], str]]
+    """What a field of kind ``names`` chooses from; where there is none, the reason."""
 
 
 def form_of(task: str) -> TaskForm | None:
@@ -139,7 +139,7 @@ def _sentence(text: str) -> str:
     return line.partition(" Rewards: see")[0]
 
 
-def groups(request: Request, task: str, queues: Sequence[str]) -> list[Group]:
+def groups(task: str, queues: Sequence[str]) -> list[Group]:
     """The wizard's fields for a task. ``queues``: those to which the caller may submit."""
     form = form_of(task)
     named = {"name": re.sub(r"[^A-Za-z0-9_-]", "-", task).strip("-").lower(), **_FIRST}
@@ -156,7 +156,7 @@ def groups(request: Request, task: str, queues: Sequence[str]) -> list[Group]:
         )
 
     found = [Group("Job", job(*_JOB), True), Group("Training", job(*_TRAINING), True)]
-    found += form.groups(request, task) if form else []
+    found += form.groups(task) if form else []
     config = config_schema(task)
     if config is None:
         hint = "This task publishes no schema; its ranks check the settings."

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 
-from fastapi import Request
-
 from orchestrator.console.submit_fields import Field, Group, TaskForm
 from orchestrator.spec.settings import task_config
 from racer.control.track_pages import OUTLINE, track_names
@@ -28,11 +26,10 @@ def _config(task: str) -> type[RacerConfig] | None:
     return kind if isinstance(kind, type) and issubclass(kind, RacerConfig) else None
 
 
-def _groups(request: Request, task: str) -> list[Group]:
+def _groups(task: str) -> list[Group]:
     """Track, action space, reward function, hyperparameters."""
     kind = _config(task)
     assert kind is not None
-    there, missing = track_names(request)
     space = json.dumps(kind().action_space, indent=1, default=dict)
     hint = (
         "In degrees and m/s, as in DeepRacer's model_metadata.json: continuous ranges, or a list of discrete actions."
@@ -40,12 +37,10 @@ def _groups(request: Request, task: str) -> list[Group]:
     tracks = Field(
         "train.config.track",
         "names",
-        tuple(there),
-        "oval",
-        "random:7",
-        "With several, the worlds take turns.",
+        value="oval",
+        placeholder="random:7",
+        hint="With several, the worlds take turns.",
         picture=OUTLINE,
-        missing=missing,
     )
     reward = Field("train.config.reward_function", "code", value=EXAMPLE, file=CODE)
     names = [Field(f"train.hyperparameters.{each}") for each in kind.hyperparameters]
@@ -59,4 +54,4 @@ def _groups(request: Request, task: str) -> list[Group]:
     ]
 
 
-FORM = TaskForm("Race", lambda task: _config(task) is not None, _groups, frozenset({"track"}))
+FORM = TaskForm("Race", lambda task: _config(task) is not None, _groups, frozenset({"track"}), track_names)

@@ -182,7 +182,7 @@ def test_trials_use_the_tracks_in_turn_and_the_table_agrees_with_the_summary(tmp
     assert race.summary()["track"] == ["oval", "chicane"]
     run = Run(tmp_path / "fast")
     run.evaluations.mkdir(parents=True)
-    told = result_of(task, played, "00000030-e1", 5, 0.0).write(run, "job", race)
+    told = result_of(task, played, "00000030-e1", 5, 0.0).write(run, "job", {"race": race})
     assert told["race"] == json.loads((run.evaluations / "00000030-e1-job.json").read_text())["race"]
     table = pyarrow.parquet.read_table(run.evaluations / told["table"]).to_pydict()
     for name, values in table.items():

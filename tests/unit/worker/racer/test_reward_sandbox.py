@@ -115,7 +115,7 @@ PLACES += [
     "{repository}",
 ]
 PLACES += [
-    "{repository}/worker/racer/rewards/guard.py",
+    "{repository}/racer/rewards/guard.py",
     "{packages}/pydantic/__init__.py",
     "{packages}/torch/__init__.py",
 ]
