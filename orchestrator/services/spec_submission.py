@@ -138,7 +138,7 @@ def submit(
     queue = submission.open_queue(context, named_queue(context.session, context.actor, spec.queue), spec.share)
     properties = with_environment(document["nodeProperties"], environment or {})
     gang = gang_needs(properties)
-    definition = definitions.register(context, spec.name, document, gang, again=False)
+    definition = definitions.revision(context, spec.name, document, gang, again=False)
     context.actor.check(Operation.SUBMIT_JOB, definition)
     _check_fit(context, spec, queue, gang, what)
     retry, timeout = document["retryStrategy"], document.get("timeout") or {}
@@ -159,6 +159,7 @@ def submit(
             tags=tags,
         ),
     )
+    context.session.add(definition)  # not before: others share the commit, and what is refused must leave nothing in it
     context.session.flush()
     return job
 

@@ -48,8 +48,8 @@ LETTERS = "expected letters, digits, '_' and '-', starting with a letter or digi
 RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128"
 TASKS = "Ant, Cartpole, CartpolePixels, G1Flat, G1Rough, Go1Flat, Go1Rough, Humanoid, LiftCube, LiftCubes, Quadruped, Racer, RacerPixels, RacerPixelsAndState"
 TOP = (
-    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, race, export, record, render, command, environment, secrets, track, image, checkpoint, evaluation, logs, retry, "
-    "on_child_failure, timeout, stall_timeout"
+    "name, queue, share, priority, preemptible, nodes, resources, train, evaluate, export, record, render, command, environment, secrets, track, image, checkpoint, evaluation, logs, retry, "
+    "on_child_failure, timeout, stall_timeout, race"
 )
 
 NODES = "expected a whole number of nodes, or {min: 2, max: 4}"
