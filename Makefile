@@ -58,7 +58,7 @@ robots: $(READY) robots-kernels
 	$(PYTEST) tests/robots
 
 services: $(READY) kernels tracking
-	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_export.py tests/training/worker/test_sim_trace.py
+	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_export.py tests/training/racer/test_sim_trace.py
 
 # pictures of the pages are left in build/console
 console: $(READY) kernels

@@ -14,9 +14,9 @@ from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import submit_gang
 from tests.support.console.fixtures import Console
 from tests.support.console.person import PHONE, People
-from tests.support.console.racers import add_league, add_racer
 from tests.support.orchestrator.jobs import await_status
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
+from tests.support.racer.racers import add_league, add_racer
 
 HOSTILE = "</pre></textarea><script>alert(1)</script><img src=x onerror=alert(1)>{{ 7 * 7 }}"
 RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]

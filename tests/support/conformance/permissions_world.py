@@ -21,7 +21,7 @@ from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.definitions import container, multinode
-from tests.support.shared_store.leagues import entry
+from tests.support.racer.leagues import entry
 
 TOKEN = "a-token-for-tests-alone"
 KEYS = ("admin", "token", "robots", "lab", "reader", "robots-reader", "lab-reader")

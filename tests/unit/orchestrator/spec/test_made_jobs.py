@@ -13,7 +13,7 @@ from orchestrator.spec.sections import Evaluation
 from racer.control.league_races import race_job
 from racer.store.leagues import CAR, Rules
 from shared_store.volume.checkpoints import Checkpoint
-from tests.support.shared_store.leagues import league
+from tests.support.racer.leagues import league
 
 TRAINED: dict[str, Any] = {
     "name": "ant",

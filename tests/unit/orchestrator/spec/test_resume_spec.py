@@ -105,7 +105,7 @@ REFUSED = {
 """Of each key that can't change: another value."""
 ELSEWHERE = {"train.worlds", "train.settings", "train.hyperparameters"}
 """Depends on the checkpoint, or on the class of the user's own: tests/training/faults/test_refusals.py and tests/long/faults/test_resume_others.py.
-Hyperparameters are settings by other names: tests/unit/worker/racer/test_hyperparameters.py."""
+Hyperparameters are settings by other names: tests/unit/racer/test_hyperparameters.py."""
 
 
 def sections_of(annotation: Any) -> list[type[BaseModel]]:

@@ -19,7 +19,7 @@ from shared_store.volume.layout import Run, Store
 from shared_store.volume.references import references
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.permissions import permissions_count
-from tests.support.shared_store.leagues import entry, league
+from tests.support.racer.leagues import entry, league
 
 
 def logged(store: Store, name: str, job: str = "j1") -> Run:

@@ -12,10 +12,10 @@ from shared_store.volume.files import write_json
 from shared_store.volume.layout import Store
 from shared_store.volume.models import Model
 from tests.support.console.fixtures import Console
-from tests.support.console.racers import add_league, add_racer
 from tests.support.console.visitor import Page, Visitor
 from tests.support.orchestrator.jobs import await_status
-from tests.support.shared_store.leagues import race, summary
+from tests.support.racer.leagues import race, summary
+from tests.support.racer.racers import add_league, add_racer
 
 # -- tracks ------------------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from shared_store.volume.files import read_json, write_json
 from shared_store.volume.layout import Store
 from shared_store.volume.models import Model
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
-from tests.support.shared_store.leagues import entry, league, race, summary
+from tests.support.racer.leagues import entry, league, race, summary
 
 TRAIN = {"task": "Racer", "worlds": 4, "iterations": 9}
 
