@@ -167,18 +167,6 @@ def test_a_key_of_the_run_s_history_is_refused_by_name_and_leads_to_a_clone(key:
         _check_changes(RUN, before, after)
 
 
-def test_a_setting_of_the_task_that_changes_nothing_of_the_training_may_change() -> None:
-    racer = {"task": "Racer", "worlds": 8, "iterations": 2, "config": {"track": "oval"}}
-    before, traced, elsewhere = (
-        validate({"name": "car", "train": {**racer, "config": {"track": track, **more}}}, "job.yaml")
-        for track, more in (("oval", {}), ("oval", {"sim_trace": 4}), ("chicane", {"sim_trace": 4}))
-    )
-    _check_changes(RUN, before, traced)
-    _check_changes(RUN, traced, before)
-    with pytest.raises(ClientError, match=r"train\.config\.track is 'oval' and can't become 'chicane'"):
-        _check_changes(RUN, before, elsewhere)
-
-
 def test_a_job_does_not_become_one_of_another_kind() -> None:
     before, after = changed("train")[0], changed("command")[0]
     with pytest.raises(ClientError, match="run ant is a train job; it can't continue as command"):
