@@ -11,11 +11,7 @@ from tests.conftest import Serving
 from tests.support.console.person import People
 
 NAME = "train.config.reward_function"
-
-
 MESSAGE = f'[data-wrong="{NAME}"]'
-
-
 BAD = re.compile(r"\bbad\b")
 
 

@@ -12,9 +12,10 @@ import pytest
 from orchestrator.cli.tasks import _numbers, _terms
 from orchestrator.cli.terminal import Console
 from tests.support.worker.robots import needs_mjlab
-from worker.tasks import BUILT_IN, find_task
+from worker.tasks import find_task
 from worker.tasks.__main__ import describe
 from worker.tasks.declare.declaration import Image
+from worker.tasks.run.find import BUILT_IN
 
 pytestmark = needs_mjlab
 DECLARED = sorted({*BUILT_IN} - {"CartpolePixels"})

@@ -16,8 +16,6 @@ RACER: dict[str, Any] = {
     "resources": {"cpus": 2, "gpus": 4, "memory": 2048},
     "train": {"task": "Racer", "worlds": 8, "iterations": 9},
 }
-
-
 FACTS = {"run": "racer-1", "iteration": 9, "spec": RACER}
 
 
