@@ -145,7 +145,7 @@ def test_a_clone_can_be_tried_without_one(full: Serving, store: Store) -> None:
 
 def test_a_job_is_submitted_under_another_name(full: Serving) -> None:
     submit = ("submit", "job_specs/cartpole.yaml", "--name")
-    done = full.muster(*submit, "second", "--json", "--set", "resources.cpus=1")
+    done = full.muster(*submit, "second", "--json", "--set", "resources.cpus=0.1")
     assert done.returncode == 0, done.stderr
     submitted = json.loads(done.stdout)
     assert submitted["jobName"] == "second" and full.detail(submitted["jobId"])["spec"]["name"] == "second"
