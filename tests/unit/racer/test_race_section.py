@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.file import load
+from orchestrator.spec.model import validate
 from orchestrator.spec.values import known_tasks
 from tests.support.refusals import refusal
 
@@ -30,3 +32,11 @@ def test_what_is_wrong_is_told_with_its_line(tmp_path: Path, text: str) -> None:
 
 def test_the_racers_tasks_are_known_by_name() -> None:
     assert {"Racer", "RacerPixels", "RacerPixelsAndState"} <= set(known_tasks())
+
+
+def test_a_checkpoint_is_named_as_every_kind_of_job_names_it() -> None:
+    for wanted in (3, "best", "latest"):
+        found: Any = validate({"name": "a", "race": {"run": "x", "checkpoint": wanted}}, "job.yaml")
+        assert found.race.checkpoint == wanted
+    with pytest.raises(SpecError, match=r"^job\.yaml: race\.checkpoint: expected an iteration, best or latest"):
+        validate({"name": "a", "race": {"run": "x", "checkpoint": "newest"}}, "job.yaml")

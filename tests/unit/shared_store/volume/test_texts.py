@@ -19,7 +19,7 @@ REFERENCE = Reference("train.config.reward_function", "long.py", DIGEST)
 
 
 def spec(value: Any, section: str = "train") -> dict[str, Any]:
-    return {"name": "job", section: {"task": "Racer", "config": {"track": "oval", "reward_function": value}}}
+    return {"name": "job", section: {"task": "elsewhere.mine:Task", "config": {"level": 3, "reward_function": value}}}
 
 
 @pytest.mark.parametrize("section", ["train", "evaluate"])
