@@ -58,7 +58,7 @@ robots: $(READY) robots-kernels
 	$(PYTEST) tests/robots
 
 services: $(READY) kernels tracking
-	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_export.py tests/training/worker/test_sim_trace.py
+	$(PYTEST) tests/training/worker/test_tracking.py tests/unit/worker/test_export.py tests/training/racer/test_sim_trace.py
 
 # pictures of the pages are left in build/console
 console: $(READY) kernels
@@ -83,7 +83,7 @@ robots-kernels: $(READY)
 
 # W&B, MLflow and LEAPP (130 MB); pandas for MLflow's own server, which the extra has without it; deepracer-utils, which reads SimTrace files
 tracking: $(READY)
-	$(BIN)/python -c 'import wandb, mlflow, leapp, pandas, deepracer' 2>/dev/null || $(BIN)/pip install --quiet --no-compile --no-warn-conflicts --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' pandas deepracer-utils
+	$(BIN)/python -c 'import wandb, mlflow, leapp, pandas, deepracer' 2>/dev/null || $(BIN)/pip install --quiet --no-compile --no-warn-conflicts --disable-pip-version-check --constraint constraints.txt --editable '.[wandb,mlflow,leapp]' --editable ./racer pandas deepracer-utils
 
 lint: $(READY)
 	$(BIN)/ruff check .
@@ -151,7 +151,7 @@ mutants: $(READY)
 env: $(READY)
 
 # .ci/environment keeps what it installs in the user's cache
-$(READY): pyproject.toml policy_node/pyproject.toml constraints.txt .ci/environment
+$(READY): pyproject.toml racer/pyproject.toml policy_node/pyproject.toml constraints.txt .ci/environment
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Muster needs Python 3.11 or newer; set PYTHON=python3.11")'
 	.ci/environment $(PYTHON) $(VENV)
 	touch $(READY)

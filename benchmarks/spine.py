@@ -93,7 +93,7 @@ class Bench:
 def lines_of_code() -> dict[str, int]:
     """Lines of each package that are neither blank nor a comment."""
     counts = {}
-    for package in ("orchestrator", "shared_store", "worker", "tests"):
+    for package in ("orchestrator", "shared_store", "worker", "racer", "tests"):
         text = [path.read_text().splitlines() for path in (REPOSITORY / package).rglob("*.py")]
         counts[package] = sum(
             1 for lines in text for line in lines if line.strip() and not line.strip().startswith("#")

@@ -13,7 +13,8 @@ from importlib.machinery import ModuleSpec
 TYPE_CHECKING = False  # a node's shim imports this package, and typing takes longer than the rest of its start
 if TYPE_CHECKING:
     from collections.abc import Mapping
-    from types import ModuleType
+    from types import CodeType, ModuleType
+    from typing import Any
 
 __version__ = "0.1.0"
 
@@ -25,11 +26,35 @@ class _OldNames:
         self._names = names
         self._specs: dict[str, ModuleSpec | None] = {}
 
+    def _new(self, name: str) -> str | None:
+        """The name that a module has now; one that is not in the table is still in its package, if that moved."""
+        if name in self._names:
+            return self._names[name]
+        package, _, module = name.rpartition(".")
+        moved = self._new(package) if package else None
+        return moved and f"{moved}.{module}"
+
+    def _found(self, name: str) -> ModuleSpec | None:
+        new = self._new(name)
+        if new is None:
+            return None
+        from importlib.util import find_spec  # few processes need it
+
+        try:
+            return find_spec(new)
+        except ModuleNotFoundError:  # the package in which it is now is not installed
+            return None
+
     def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        return ModuleSpec(name, self) if name in self._names else None  # type: ignore[arg-type]
+        found = self._found(name)
+        if found is None:
+            return None
+        spec = ModuleSpec(name, self, origin=found.origin)  # type: ignore[arg-type]
+        spec.submodule_search_locations = found.submodule_search_locations
+        return spec
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        module = import_module(self._names[spec.name])
+        module = import_module(self._new(spec.name) or spec.name)
         self._specs[spec.name] = module.__spec__
         return module
 
@@ -38,12 +63,19 @@ class _OldNames:
         assert module.__spec__ is not None
         module.__spec__ = self._specs[module.__spec__.name]
 
+    def get_code(self, name: str) -> CodeType | None:
+        """For ``python -m`` with an old name."""
+        found = self._found(name)
+        loader: Any = found and found.loader
+        code: CodeType | None = loader and loader.get_code(found and found.name)
+        return code
+
 
 def keep_old_names(names: Mapping[str, str]) -> None:
-    """Let modules be imported by their old names, too, since tasks and engines of others may hold these.
+    """Let modules be imported, and run with ``python -m``, by their old names, too, since tasks, engines and jobs of others hold these.
 
     Args:
-        names: Old name → new name. A package needs an entry for each of its modules that is still imported by its old name.
+        names: Old name → new name. A package stands for all of its modules that are not named themselves.
     """
     sys.meta_path.insert(0, _OldNames(names))
 
@@ -52,9 +84,13 @@ OLD_NAMES = {
     "shared_store.checkpoints": "shared_store.volume.checkpoints",
     "shared_store.file_fields": "shared_store.contract.file_fields",
     "shared_store.layout": "shared_store.volume.layout",
+    "shared_store.leagues": "racer.store.leagues",
     "shared_store.policy_contract": "shared_store.contract.policy",
     "shared_store.ports": "shared_store.process.ports",
     "shared_store.processes": "shared_store.process.processes",
+    "shared_store.races": "racer.store.races",
+    "shared_store.standings": "racer.store.standings",
+    "shared_store.tracks": "racer.store.tracks",
 }
 """Names in the documentation before the modules moved into rooms."""
 keep_old_names(OLD_NAMES)

@@ -1,4 +1,4 @@
-"""The racer: a 1:18 car drives laps on a track, from numbers about the road or from its camera."""
+"""The racer's tasks: a 1:18 car drives laps on a track, from numbers about the road or from its camera."""
 
 from __future__ import annotations
 

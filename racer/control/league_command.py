@@ -1,4 +1,4 @@
-"""``muster league``: competitions for the fastest laps under one set of rules."""
+"""The command ``muster league``: competitions for the fastest laps under one set of rules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Leagues: rules, the table, entries, and a race of a model by the rules of one."""
+"""The pages of leagues: rules, the table, entries, and a race of a model by the rules of one."""
 
 from __future__ import annotations
 

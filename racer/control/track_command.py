@@ -1,4 +1,4 @@
-"""``muster tracks``: the racer's tracks."""
+"""The command ``muster tracks``: the racer's tracks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tracks of the racer, by a process of the worker's: this package never imports their code."""
+"""Orders about tracks, carried out by a process of their own: the controller never imports numpy."""
 
 from __future__ import annotations
 

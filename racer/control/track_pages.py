@@ -1,4 +1,4 @@
-"""The racer's tracks: pictures and measures."""
+"""The pages of tracks: pictures and measures."""
 
 from __future__ import annotations
 

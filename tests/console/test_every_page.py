@@ -6,28 +6,26 @@ import re
 from typing import Any
 
 import pytest
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import expect
 
 from shared_store.volume.layout import Store
 from shared_store.volume.metrics import MetricsWriter
 from tests.conftest import submit_gang
 from tests.support.console.fixtures import Console
+from tests.support.console.looks import assert_fit_a_phone, assert_no_faults
 from tests.support.console.person import PHONE, People
-from tests.support.console.racers import add_league, add_racer
 from tests.support.orchestrator.jobs import await_status
+from tests.support.orchestrator.models import add_model
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
 
 HOSTILE = "</pre></textarea><script>alert(1)</script><img src=x onerror=alert(1)>{{ 7 * 7 }}"
-RULES = ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa"]
 
 
 @pytest.fixture(scope="module")
 def places(console: Console) -> dict[str, str]:
     """The addresses of pages that have something to show, by a name."""
     store = Store(console.server.home / "store")
-    add_racer(store, "fast", "fast-run", 8)
-    add_league(store, "cup", "ada", "grace")
+    add_model(store, "fast", "fast-run", 8)
     add_run(store, "taught", {**SPEC, "environment": {"TEXT": HOSTILE}})
     for iteration in (3, 6, 9):
         add_checkpoint(store, "taught", iteration, score=float(iteration), score_error=0.5)
@@ -37,41 +35,22 @@ def places(console: Console) -> dict[str, str]:
     said = submit_gang(console.client, f"print({HOSTILE!r}); raise ValueError({HOSTILE!r})", name="said", cpus="0.5")
     await_status(console.client, said, "FAILED")
     training = console.client.post("/api/runs/taught/resume", {"set": ["train.iterations=20"]})["jobId"]
-    lists = {each: f"/{each}" for each in ("submit", "runs", "queues", "keys", "models", "leagues", "tracks")}
-    runs = {"run": "/runs/taught", "compare": "/compare?run=taught", "model": "/models/fast", "track": "/tracks/oval"}
+    lists = {each: f"/{each}" for each in ("submit", "runs", "queues", "keys", "models")}
+    runs = {"run": "/runs/taught", "compare": "/compare?run=taught", "model": "/models/fast"}
     jobs = {"jobs": "/", "training": f"/jobs/{training}", "command": f"/jobs/{said}", "missing": "/jobs/none"}
-    forms = {"wizard": "/submit/task/Racer", "yaml": "/submit/yaml", "queue": "/queues?queue=lab"}
-    return {**lists, **runs, **jobs, **forms, "league": "/leagues/cup", "entry": "/leagues/cup/entries/1"}
+    forms = {"wizard": "/submit/task/Cartpole", "yaml": "/submit/yaml", "queue": "/queues?queue=lab"}
+    return {**lists, **runs, **jobs, **forms}
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_axe_finds_no_fault_on_any_page(console: Console, people: People, places: dict[str, str], scheme: Any) -> None:
     person = people(console.url, console.secrets["admin"], color_scheme=scheme)
-    faults = []
-    for name, path in places.items():
-        page = person.goto(path)
-        page.wait_for_load_state("load")
-        page.evaluate("for (const each of document.querySelectorAll('details')) each.open = true")
-        found = Axe().run(page, options={"runOnly": RULES})
-        faults += [f"{name}: {fault_of(each)}" for each in found.response["violations"]]
-        person.picture(f"{name}-{scheme}")
-    assert not faults, "\n".join(faults)
-
-
-def fault_of(violation: dict[str, Any]) -> str:
-    first = violation["nodes"][0]
-    return f"{violation['id']} ({len(violation['nodes'])}): {first['html'][:200]} {first['failureSummary'][:300]}"
+    assert_no_faults(person, places, scheme)
 
 
 def test_no_page_is_wider_than_a_phone(console: Console, people: People, places: dict[str, str]) -> None:
     person = people(console.url, console.secrets["admin"], viewport=PHONE, has_touch=True, is_mobile=True)
-    wide = {}
-    for name, path in places.items():
-        page = person.goto(path)
-        page.wait_for_load_state("load")
-        person.picture(f"{name}-phone")
-        wide[name] = page.evaluate("document.documentElement.scrollWidth")
-    assert {name: width for name, width in wide.items() if width > PHONE["width"]} == {}
+    assert_fit_a_phone(person, places)
 
 
 def test_what_a_job_says_is_text_in_its_log(console: Console, people: People, places: dict[str, str]) -> None:

@@ -103,7 +103,7 @@ def test_a_stream_ends_with_its_readers_session(console: Console, way: str) -> N
 def test_a_session_reads_the_api_and_changes_nothing_through_it(visitor: Visitor) -> None:
     assert visitor.http.get("/api/jobs").json()["jobs"] == []
     assert "GET /api/jobs" in visitor.page("/api/docs").text
-    for path in ("/v1/createjobqueue", "/api/leagues", "/"):
+    for path in ("/v1/createjobqueue", "/api/jobs", "/"):
         headers = {"Accept": "*/*", "X-Amz-Target": "Logs_20140328.DescribeLogGroups"}
         answer = visitor.http.post(path, json={}, headers=headers)
         assert answer.status_code == 403 and answer.headers["x-amzn-errortype"] == "MissingAuthenticationToken", path

@@ -42,7 +42,7 @@ PAGES = (
         "/runs/{name}/curves",
         "/compare?run={name}",
     ),
-    *("/jobs/{reference}", "/jobs/{reference}/log", "/jobs/{reference}/log/search", "/models", "/lineage", "/tracks"),
+    *("/jobs/{reference}", "/jobs/{reference}/log", "/jobs/{reference}/log/search", "/models", "/lineage"),
     *("/queues", "/submit/task/Cartpole", "/submit/yaml?job={reference}"),
 )
 AT_ONCE = 12
@@ -176,7 +176,7 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
             )
             # the look before may have found the path empty
             wait_for(lambda: said in (server.controller.access.disk.away("store") or ""), 60, "that it is seen")
-            answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/tracks", "/runs/taught")]
+            answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/models", "/runs/taught")]
             for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
                 body = {"name": "copied"}
                 answers.append(httpx.post(f"{server.url}/api/{asks}", json=body, timeout=60))

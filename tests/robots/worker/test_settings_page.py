@@ -13,7 +13,7 @@ import yaml
 
 from tests.conftest import REPOSITORY
 from tests.support.worker.robots import needs_mjlab
-from worker.tasks import BUILT_IN
+from worker.tasks.run.find import BUILT_IN
 from worker.tasks.settings_page import FAMILIES, MJLAB, page, sketch
 
 pytestmark = needs_mjlab

@@ -20,7 +20,8 @@ from shared_store.volume.metrics import read_metrics
 from tests.conftest import REPOSITORY, run_muster
 from tests.support.worker.tasks import observe, put, statistics
 from worker.learning.job import configure
-from worker.tasks import BUILT_IN, find_task
+from worker.tasks import find_task
+from worker.tasks.run.find import BUILT_IN
 
 OWN = "job_specs.my_task:Pendulum"
 

@@ -1,8 +1,9 @@
-"""A server with objects of two queues and a caller of every kind."""
+"""A server with objects of two queues and a caller of every kind, and what each may do there."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,22 +12,29 @@ import httpx
 from orchestrator.api.logs import operations as logs
 from orchestrator.client import Client
 from orchestrator.keys import KeyStore
-from orchestrator.services.permissions import Operation
+from orchestrator.services.permissions import HIDDEN
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
-from racer.store import leagues
 from shared_store.volume import models, texts
 from shared_store.volume.bundles import seal
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.definitions import container, multinode
-from tests.support.shared_store.leagues import entry
 
 TOKEN = "a-token-for-tests-alone"
 KEYS = ("admin", "token", "robots", "lab", "reader", "robots-reader", "lab-reader")
 """The callers: keys for all queues, MUSTER_TOKEN, keys kept to the queues robots and lab, and the same three read-only."""
 SECRET, MARK = "hunter2-the-secret", "robots line"
+
+OWN_WRITE = "+ + + - - - -"
+"""What belongs to the queue robots is changed: ``+`` is carried out, ``-`` is refused."""
+NAMED_WRITE = "+ + + n - - -"
+"""The same, found by its name: ``n`` answers as if it did not exist; a read-only key is refused before anything is looked for."""
+SHARED_WRITE = "+ + - - - - -"
+SHARED_READ = "+ + + + + + +"
+OWN_MADE = "+ + + + - - -"
+"""Something is created, which then is the caller's."""
 
 
 class World:
@@ -56,7 +64,6 @@ class World:
         self.server.wait(self.job)
         self.stream = f"theirs/{self.job}/1/node-0"
         self.register_model()
-        self.create_league()
 
     def register_model(self) -> None:
         """A model of the run's name; its spec has the secret, as a run's has."""
@@ -68,13 +75,6 @@ class World:
         seal(bundle, {})
         checkpoint = Checkpoint(run.checkpoints / bundle.name, 1, 1)
         models.register(store, self.run, run, checkpoint, {"queue": "robots"})
-
-    def create_league(self) -> None:
-        """A league of the run's name with an entry of the model, both of the key ``robots``."""
-        self.clients["robots"].post("/api/leagues", {"name": self.run, "track": ["oval"]})
-        cup = leagues.find(Store(self.server.home / "store"), self.run)
-        model = {"name": self.run, "version": 1, "digest": "0" * 64, "task": "Racer"}
-        cup.enter(entry("robots", "key robots", model=model))
 
     def native(self, key: str, queue: str, **changes: Any) -> tuple[str, str]:
         """Submit a job from YAML; its id and its run."""
@@ -113,13 +113,13 @@ class World:
             return self.http.post(self.url, json=request, headers=bearer)
         return self.http.post(f"{self.url}/v1/{operation.lower()}", json=request, headers=bearer)
 
-    def native_call(self, key: str, operation: Operation, body: dict[str, Any] | None = None) -> httpx.Response:
+    def native_call(self, key: str, operation: str, body: dict[str, Any] | None = None) -> httpx.Response:
         method, _, path = operation.partition(" ")
         path = path.format(reference=self.job, name=self.run, number=1)
         bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
         return self.http.request(method, self.url + path, json=body, headers=bearer)
 
-    def text_call(self, key: str, operation: Operation, text: str) -> httpx.Response:
+    def text_call(self, key: str, operation: str, text: str) -> httpx.Response:
         """Upload a text, or read it as one of the run's."""
         digest = texts.keep(self.server.home / "store" / "runs" / self.run / "texts", text.encode())
         method, _, path = operation.partition(" ")
@@ -136,3 +136,40 @@ class World:
 
 def definition(name: str) -> dict[str, Any]:
     return multinode(name, container(["echo", MARK], env={"SECRET": SECRET}))
+
+
+def refusal_of(answer: httpx.Response, key: str) -> None:
+    told = answer.json()
+    assert (answer.status_code, told.get("__type")) == (403, "AccessDeniedException"), (key, answer.text)
+    assert f"key {key} " in told["message"] and "\n" not in told["message"], told
+
+
+def answers_as(row: str, world: World, operation: str, call: Callable[[str], httpx.Response], reads: bool) -> None:
+    """The operation answers each of :data:`KEYS` as its row of the table says.
+
+    Args:
+        reads: Whether its answer tells of objects of the world.
+    """
+    for key, expected in zip(KEYS, row.split(), strict=True):
+        answer = call(key)
+        if key == "admin":
+            full = MARK if operation == "StartLiveTail" else answer.text
+        if expected == "-":
+            refusal_of(answer, key)
+            continue
+        if expected == "n":
+            assert answer.status_code == 404 and "does not exist" in answer.text, (operation, key, answer.text)
+            assert "robots" not in answer.text, (operation, key, answer.text)
+            continue
+        assert answer.status_code in (200, 307, 400, 409), (operation, key, answer.text)  # 400, 409: of its state
+        assert ('"AccessDenied"' in answer.text) is (expected == "e"), (operation, key, answer.text)
+        if not reads:
+            continue
+        text = answer.text
+        for mark in (MARK, world.job):
+            if "o" in row and mark in full:
+                assert (mark in text) is (expected != "o"), (operation, key, mark, text)
+        if SECRET in full:
+            assert expected in ("+", "h", "o"), (operation, key)
+            assert (SECRET in text) is (expected == "+"), (operation, key, text)
+            assert (HIDDEN in text) is (expected == "h"), (operation, key, text)

@@ -38,7 +38,7 @@ from tests.support.suite.caches import kernel_cache
 
 REPOSITORY = Path(__file__).parents[3]
 KILLED, SURVIVED, TIMED_OUT = "killed", "survived", "timed out"
-_OURS = ("orchestrator", "shared_store", "worker", "tests", "muster_policy")
+_OURS = ("orchestrator", "shared_store", "worker", "racer", "tests", "muster_policy")
 _EXAMPLES = 10
 """Examples that Hypothesis tries in each test at most."""
 _TIMES, _MORE = 10, 5.0

@@ -12,14 +12,15 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import entry_points
 from pathlib import Path
 
-import worker
 from tests.support.suite.caches import kernel_cache
 
+REPOSITORY = Path(__file__).parents[3]
 CACHE = Path(os.environ.setdefault("WARP_CACHE_PATH", str(kernel_cache())))
 TASKS = ("Humanoid", "Ant", "Cartpole", "Quadruped", "CartpolePixels", "Racer", "RacerPixels")
-"""Those of the tests of three tiers; ``make robots`` names its own."""
+"""Those of the tests of three tiers, as far as they are installed; ``make robots`` names its own."""
 
 
 def compile_for(name: str) -> None:
@@ -44,9 +45,10 @@ def compile_for(name: str) -> None:
 def _sources() -> str:
     """A digest of all that the kernels of this clone are generated from; the cache's path holds the versions of libraries."""
     digest = hashlib.sha256()
-    for path in sorted(Path(worker.__file__).parent.rglob("*")):
-        if path.suffix in (".py", ".xml"):
-            digest.update(path.read_bytes())
+    for package in ("worker", "racer"):
+        for path in sorted((REPOSITORY / package).rglob("*")):
+            if path.suffix in (".py", ".xml"):
+                digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -72,4 +74,5 @@ if __name__ == "__main__":
     if sys.argv[1:2] == ["--one"]:
         compile_for(sys.argv[2])
     else:
-        sys.exit(main(sys.argv[1:] or TASKS))
+        tasks = {point.name for point in entry_points(group="muster.tasks")}
+        sys.exit(main(sys.argv[1:] or [name for name in TASKS if name in tasks]))

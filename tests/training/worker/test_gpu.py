@@ -11,6 +11,7 @@ import torch
 import warp as wp
 from torch import nn
 
+from tests.support.worker.on_device import has_a_row_for_each_step, iterates_without_waiting, training_of
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.host_copies import HostCopies
 from worker.learning.ppo import linear_layers as linear
@@ -25,21 +26,6 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
     "Cartpole": ("Cartpole", {}),
     "Ant": ("Ant", {}),
     "images": ("CartpolePixels", {}),
-    "a car that no physics moves": ("Racer", {}),
-    "a car that slides and chooses": (
-        "Racer",
-        {
-            "config": {
-                "friction": [0.4, 0.9],
-                "action_space": {
-                    "action_space": [{"steering_angle": angle, "speed": 2.0} for angle in (-30, 0, 30)],
-                    "action_space_type": "discrete",
-                },
-            }
-        },
-    ),
-    "cars of which each step is logged": ("Racer", {"config": {"sim_trace": 16}}),
-    "a camera on a car": ("RacerPixels", {"config": {"front": {"width": 64, "height": 64}}}),
     "a camera on a body": ("tests.support.worker.seeing:SeeingDepth", {}),
     "a critic of its own": (
         "Cartpole",
@@ -53,27 +39,14 @@ CASES: dict[str, tuple[str, dict[str, Any]]] = {
 }
 
 
-def runner(store: Path, case: str, worlds: int = 256):
-    from benchmarks.training import build
-
+def runner(store: Path, case: str):
     task, train = CASES[case]
-    return build(task, worlds, store, **train)
+    return training_of(store, task, train)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_an_iteration_is_a_few_graphs_and_never_waits_for_the_device(tmp_path: Path, case: str) -> None:
-    training = runner(tmp_path, case)
-    for _ in range(6):
-        training._iterate()
-    parts = [training._collecting, *training.algorithm.graphs]
-    assert all(part.captured for part in parts) and training.task.captured
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        for _ in range(3):
-            training._iterate()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert training.state.progress.iteration == 9
+    iterates_without_waiting(tmp_path, *CASES[case])
 
 
 @pytest.mark.parametrize("case", ["Cartpole", "a critic of its own", "AdamW", "sac"])
@@ -175,17 +148,5 @@ def test_copies_of_a_state_that_grows_and_shrinks_are_right() -> None:
         assert torch.equal(copied["replay"], state["replay"].cpu()) and int(copied["place"]) == length
 
 
-@pytest.mark.parametrize("case", ["Cartpole", "a car that slides and chooses", "a camera on a car"])
-def test_each_control_step_of_a_rollout_is_one_row_however_late_the_device_is(tmp_path: Path, case: str) -> None:
-    from benchmarks.training import build
-    from worker.telemetry.rollout import Rollout
-
-    task, train = CASES[case]
-    training = build(task, 32, tmp_path, iterations=1, **train)
-    training.train()
-    rollout = Rollout.of(training.job.run, {}, 1)
-    work = torch.zeros(4096, 4096, device="cuda")
-    for number, rows in enumerate(rollout.steps(20)):
-        assert (rows.first, rows.lost, len(rows)) == (number, 0, 1)
-        for _ in range(20):  # the device is behind the host
-            work @ work
+def test_each_control_step_of_a_rollout_is_one_row_however_late_the_device_is(tmp_path: Path) -> None:
+    has_a_row_for_each_step(tmp_path, *CASES["Cartpole"])

@@ -3,50 +3,34 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import re
 import signal
 import socket
 import subprocess
-import sys
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from muster_policy.actions import Commands
-from muster_policy.bundle import open_bundle
 from muster_policy.graph import Node, open_session
 from muster_policy.messages import Messages
-from muster_policy.policy import Policy as NodePolicy
-from racer.car.task import RacerPixels
-from racer.settings.task import FrontCameraConfig, RacerPixelsConfig
-from shared_store.volume.layout import Run
-from tests.conftest import PATIENCE, REPOSITORY, wait_for
+from tests.conftest import PATIENCE, wait_for
 from tests.support.policy_node import Wired, assert_sees_what_the_task_sees
-from tests.support.worker.loop import setting_of
-from worker.deploy import bundle
+from tests.support.worker.bundles import ENVIRONMENT, NODE, bundle_of
 from worker.deploy.simulated_robot import SimulatedRobot, open_robot, play
 from worker.learning.algorithm import ExportedPolicy
-from worker.learning.algorithms import find_algorithm
-from worker.learning.setup import spaces_of
 from worker.settings.cartpole import CartpolePixelsConfig
 from worker.settings.errors import UserError
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.library.cartpole_pixels import CartpolePixels
 from worker.tasks.run.policy_contract import policy_contract
-from worker.tasks.run.task import Task
 
 SECONDS, EPISODES, SEED = 2.0, 3, 11
 GAINS = (1.0, 10.0, 1.5, 2.0)
 """Of a linear policy that balances: on the cart's and the pole's position, on their velocities."""
-NODE = [sys.executable, "-m", "muster_policy.cli"]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(REPOSITORY / "policy_node")}
 
 
 class Linear(nn.Module):
@@ -76,15 +60,6 @@ class Balancing:
         sample = torch.randn(16, 4)
         seen = TensorDict({"policy": sample}, batch_size=[16])
         return ExportedPolicy(self.network, {"obs": sample[:1]}, ["actions"], seen)
-
-
-def bundle_of(task: Task, policy: Any, folder: Path, **config: Any) -> Path:
-    """A bundle as ``muster export`` writes it."""
-    name = type(task).__name__
-    facts = {"task": name, "algorithm": "ppo", "train": {"task": name, "config": config}, "settings": {}, "files": {}}
-    checkpoint: Any = SimpleNamespace(name="00000001-e1", iteration=1, manifest=facts)
-    contract = policy_contract(task, name, policy.module())
-    return bundle.export(Run(folder), checkpoint, task, (policy, policy), contract, rounds=0)
 
 
 @pytest.fixture(scope="module")
@@ -168,27 +143,3 @@ def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
         open_robot(exported, Messages())
     with pytest.raises(UserError, match=r"manifest\.json is missing"):
         open_robot(exported.parent, Messages())
-
-
-def test_the_node_drives_a_car_whose_policy_chooses_among_actions(tmp_path: Path) -> None:
-    """Its choices of the camera's images are the trained policy's, and what it commands is what reaches the car."""
-    space = {"action_space": [{"steering_angle": angle, "speed": 1.0} for angle in (-30, -10, 10, 30)]}
-    config = RacerPixelsConfig(action_space=space, front=FrontCameraConfig(width=64, height=48))
-    task = RacerPixels(config, 4, seed=1)
-    setting = dataclasses.replace(setting_of(task, seed=5), spaces=spaces_of(task))
-    policy = find_algorithm("ppo")(config.ppo, setting).policy()
-    path = bundle_of(task, policy, tmp_path)
-    checked = subprocess.run([*NODE, str(path), "--check"], capture_output=True, text=True, env=ENVIRONMENT)
-    assert checked.returncode == 0, checked.stdout + checked.stderr
-
-    opened = open_bundle(path)
-    node, commands = NodePolicy(opened), Commands(opened.contract)
-    assert node.self_test(opened.parity) == 0.0 and commands.joints == ["steering", "speed"]
-    task.reset()
-    for _ in range(5):
-        images = task.groups["policy"]
-        chosen = node.act({"obs": images.numpy()})
-        np.testing.assert_array_equal(chosen, policy.act(TensorDict(dict(task.groups), batch_size=[4])).numpy())
-        task.step(torch.from_numpy(chosen))
-        asked = [commands.command(each).values for each in chosen]
-        np.testing.assert_allclose(asked, task.sensors["car"].arrays.commands.numpy(), rtol=1e-6)

@@ -2,36 +2,20 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
-from tests.conftest import PATIENCE
+from tests.support.worker.fresh_process import Settings, goes_on_in_a_fresh_process, make
 from tests.support.worker.tasks import play, same
-from worker.tasks import find_task
 from worker.tasks.run.find import BUILT_IN
-from worker.tasks.run.task import Task
 
 torch.set_num_threads(1)
-REPOSITORY = Path(__file__).parents[3]
-SETTINGS = {
+SETTINGS: Settings = {
     "Cartpole": {},
     "CartpolePixels": {},
     "Ant": {"episode_seconds": 0.5},
-    "Racer": {
-        "episode_seconds": 2.0,
-        "track": ["oval", "random:4"],
-        "alternate_direction": True,
-        "speed_factor": [0.8, 1.2],
-        "obstacles": [{"distance": 3.0}],
-        "randomize": {"action_latency": 2},
-    },
-    "RacerPixels": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24, "frames": 2}},
-    "RacerPixelsAndState": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24}},
     "Humanoid": {"episode_seconds": 0.5},
     "Quadruped": {"episode_seconds": 0.5, "command_seconds": 0.14},
     "Quadruped in random worlds": {
@@ -48,23 +32,6 @@ SETTINGS = {
 """Episodes and commands are short, so that there are resets and new commands before and after each point."""
 
 
-def make(name: str, worlds: int = 8, seed: int = 1, first_world: int = 0) -> Task:
-    task = find_task(name.split()[0])
-    return task(task.config_type(**SETTINGS[name]), worlds, seed=seed, first_world=first_world)
-
-
-def resume(saved: str, out: str) -> None:
-    """What the fresh process does."""
-    states = torch.load(saved, weights_only=True)
-    histories = {}
-    for name in SETTINGS:
-        # the seed of what happens is part of the state; the seed of what worlds are like must be the same
-        task = make(name, seed=99 if name in BUILT_IN else 1)
-        task.load_state_dict(states[name])
-        histories[name] = [list(step) for step in play(task, 80, seed=8)]
-    torch.save(histories, out)
-
-
 def test_every_built_in_task_is_tested() -> None:
     """Those of real robots and the arm in tests/robots."""
     robots = {"Go1Flat", "Go1Rough", "G1Flat", "G1Rough", "LiftCube", "LiftCubes"}
@@ -72,32 +39,12 @@ def test_every_built_in_task_is_tested() -> None:
 
 
 def test_a_fresh_process_goes_on_bit_for_bit(tmp_path: Path) -> None:
-    tasks = {name: make(name) for name in SETTINGS}
-    saved = {}
-    for name, task in tasks.items():
-        task.set_random_episode_length()
-        play(task, 20, seed=7)
-        saved[name] = task.state_dict()
-        assert all(len(tensor) == 8 for tensor in saved[name].values())
-    torch.save(saved, tmp_path / "saved.pt")
-    script = "import sys; from tests.training.worker.test_resume import resume; resume(*sys.argv[1:])"
-    subprocess.run(
-        [sys.executable, "-c", script, str(tmp_path / "saved.pt"), str(tmp_path / "out.pt")],
-        check=True,
-        cwd=REPOSITORY,
-        env={**os.environ, "PYTHONPATH": str(REPOSITORY)},
-        timeout=200 * PATIENCE,
-    )
-    resumed = torch.load(tmp_path / "out.pt", weights_only=True)
-    for name, task in tasks.items():
-        going_on = play(task, 80, seed=8)
-        assert same(going_on, resumed[name]), name
-        assert sum(int(step[2].sum()) for step in going_on) > 8, "resets were compared, too"
+    goes_on_in_a_fresh_process(SETTINGS, tmp_path)
 
 
 @pytest.mark.parametrize("name", ["Cartpole", "Quadruped in random worlds"])
 def test_worlds_are_the_same_however_they_are_dealt_out(name: str) -> None:
-    tasks = [make(name), *(make(name, 4, first_world=first) for first in (0, 4))]
+    tasks = [make(SETTINGS, name), *(make(SETTINGS, name, 4, first_world=first) for first in (0, 4))]
     for task in tasks:
         task.set_random_episode_length()
     ages = tasks[0].episode_length.clone()
@@ -107,7 +54,7 @@ def test_worlds_are_the_same_however_they_are_dealt_out(name: str) -> None:
     joined = [tuple(torch.cat(pair) for pair in zip(*steps, strict=True)) for steps in zip(*parts, strict=True)]
     assert same(whole, joined)
     assert sum(int(step[2].sum()) for step in whole) > 8, "resets were compared, too"
-    assert not same(whole, play(make(name, seed=2), 120, seed=6))
+    assert not same(whole, play(make(SETTINGS, name, seed=2), 120, seed=6))
 
 
 def test_what_a_task_keeps_from_step_to_step_belongs_to_the_state() -> None:

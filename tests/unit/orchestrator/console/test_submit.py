@@ -9,7 +9,6 @@ import pytest
 from orchestrator.console.forms import Form
 from orchestrator.console.submit_fields import Group, document, filled, groups, tasks, written
 from orchestrator.console.submit_help import Problem, help_at, problem_of
-from orchestrator.spec import strict_yaml
 from orchestrator.spec.file import from_text
 
 
@@ -20,18 +19,6 @@ def test_the_wizard_of_every_task_begins_with_a_job_that_can_be_submitted() -> N
         assert not any(each.startswith(":") or "`" in each for each in tasks()[task].split())
         names = [each.name for group in groups(task, ["default"]) for each in group.fields]
         assert len(names) == len(set(names)), "no two fields have one name"
-
-
-CODES = ("def f():\n    return 1\n", "# ½ 😀\n\n\n\tx = 'a: b'\n", "  indented\nless\n", "trailing \n\n", "one line")
-
-
-@pytest.mark.parametrize("code", [*CODES, "#:\n- &a *b\n"])
-def test_code_comes_out_of_the_yaml_as_it_was_written(code: str) -> None:
-    name = "train.config.reward_function"
-    form = Form({name: [code.replace("\n", "\r\n")], "train.config.track": ["a", "b"], "name": ["x"]})
-    job, _ = strict_yaml.load(written(document("Racer", filled(form, groups("Racer", [])))))
-    assert job["train"]["config"]["reward_function"]["text"].rstrip("\n") == code.rstrip("\n")
-    assert job["train"]["config"]["track"] == ["a", "b"]
 
 
 def test_settings_of_an_algorithm_that_is_not_chosen_are_left_out() -> None:
@@ -57,23 +44,20 @@ def test_a_value_is_read_as_yaml_and_stays_a_text_where_it_is_none(text: str) ->
 JOB = """name: x
 nodes: {min: 1, max: 2}
 train:
-  task: Racer
+  task: CartpolePixels
   worlds: 1
   config:
-    track: oval
-    reward_function:
-      file: a.py
-      text: |
-        def reward_function(params):
-            return 1.0
+    cart_limit: 2.0
+    camera:
+      width: 32
   ppo:
     gamma: 0.9
 """
 
 
 HELP = {1: ("", "name"), 2: ("nodes", "max"), 3: ("train", "worlds"), 4: ("train", "iterations"), 0: ("", "queue")}
-HELP |= {6: ("train.config", "track"), 7: ("train.config", "lidar"), 9: ("train.config.reward_function", "text")}
-HELP |= {12: ("train.config.reward_function", "file"), 14: ("train.ppo", "learning_rate"), 99: ("train.ppo", "gamma")}
+HELP |= {6: ("train.config", "cart_limit"), 7: ("train.config", "camera"), 9: ("train.config.camera", "height")}
+HELP |= {11: ("train.ppo", "learning_rate"), 99: ("train.ppo", "gamma")}
 
 
 @pytest.mark.parametrize("line", HELP)
@@ -91,12 +75,9 @@ def test_help_says_what_a_key_is_and_which_are_given_also_in_what_is_not_yaml_ye
     assert help_at("name: [", 1)["section"] == "" == help_at("", 1)["section"]
 
 
-def test_an_error_has_its_key_its_line_and_that_of_its_code() -> None:
-    code = "reward_function.py:2: FORBIDDEN: open can't be used"
-    found = problem_of(f"job.yaml:8: train.config.reward_function: {code}", JOB)
-    assert found == Problem(code, "train.config.reward_function", 12, 2)
-    inline = JOB.replace("text: |", 'text: "')
-    assert problem_of(f"job.yaml:8: train.config.reward_function: {code}", inline).line == 8
+def test_an_error_has_its_key_and_its_line() -> None:
+    found = problem_of("job.yaml:9: train.config.camera.width: expected", JOB)
+    assert found == Problem("expected", "train.config.camera.width", 9)
     assert problem_of("job.yaml:3: not valid YAML: what", JOB) == Problem("not valid YAML: what", "", 3)
     assert problem_of("job.yaml: expected a mapping", "") == Problem("expected a mapping")
     assert problem_of("something: else", "") == Problem("something: else")

@@ -29,7 +29,7 @@ from tests.support.refusals import refusal
 TEXT = "def reward_function(params):\n    return 1.0\n"
 DIGEST = digest_of(TEXT)
 LONG = {"file": "long.py", "text": TEXT + "#" * (30 << 10)}
-_TRAIN = {"task": "Racer", "worlds": 4, "iterations": 1, "config": {"reward_function": LONG}}
+_TRAIN = {"task": "elsewhere.mine:Task", "worlds": 4, "iterations": 1, "config": {"reward_function": LONG}}
 
 
 @pytest.fixture

@@ -162,7 +162,7 @@ def test_secrets_become_those_of_the_job_definition() -> None:
     assert json.loads(carried["value"])["secrets"] == {"WANDB_API_KEY": "wandb"}  # the name alone
 
 
-@pytest.mark.parametrize("kind", ["evaluate", "race", "export", "record", "render"])
+@pytest.mark.parametrize("kind", ["evaluate", "export", "record", "render"])
 def test_a_checkpoint_is_named_in_the_same_ways_by_every_kind_of_job(kind: str) -> None:
     for wanted in (3, "best", "latest"):
         job = {"name": "a", kind: {"run": "x", "checkpoint": wanted}}

@@ -1,4 +1,4 @@
-"""Jobs that Muster makes itself: evaluations of checkpoints that are due, and races of a league."""
+"""Jobs that Muster makes itself: evaluations of checkpoints that are due."""
 
 from __future__ import annotations
 
@@ -10,10 +10,7 @@ import pytest
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec.evaluations import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
 from orchestrator.spec.sections import Evaluation
-from racer.control.league_races import race_job
-from racer.store.leagues import CAR, Rules
 from shared_store.volume.checkpoints import Checkpoint
-from tests.support.shared_store.leagues import league
 
 TRAINED: dict[str, Any] = {
     "name": "ant",
@@ -96,32 +93,3 @@ def test_a_spec_of_the_batch_api_is_read_with_care() -> None:
     assert wanted_of(None) is wanted_of(TRAINED) is wanted_of({"command": ["x"], "evaluation": {"every": 1}}) is None
     with pytest.raises(SpecError, match=r"^evaluation\.every: expected a value greater than or equal to 1, found 0$"):
         wanted_of({**TRAINED, "evaluation": {"every": 0}})
-
-
-RACER: dict[str, Any] = {
-    "name": "racer",
-    "queue": "robots",
-    "environment": {"LEVEL": "1"},
-    "nodes": 2,
-    "resources": {"cpus": 2, "gpus": 4, "memory": 2048},
-    "train": {"task": "Racer", "worlds": 8, "iterations": 9},
-}
-FACTS = {"run": "racer-1", "iteration": 9, "spec": RACER}
-
-
-def test_a_race_is_driven_by_the_league_s_rules_on_one_node_like_those_of_the_training() -> None:
-    rules = Rules(laps=5, continuous=True, off_track_penalty=2.0, max_resets=4, seconds=60.0, ranking="best")
-    spec = race_job(league("grand.prix", track=("oval", "hills"), rules=rules), "fast@3", FACTS, "lab")
-    assert (spec.name, spec.kind, spec.queue, spec.nodes.max) == ("race-grand-prix-fast-3", "race", "lab", 1)
-    assert (spec.resources.cpus, spec.resources.gpus, spec.environment) == (2, 1, {"LEVEL": "1"})
-    assert spec.race is not None and spec.race.model_dump() == {
-        **{"run": "racer-1", "checkpoint": 9, "trials": 5, "continuous": True, "off_track_penalty": 2.0, "keep": True},
-        **{
-            "crash_penalty": 1.0,
-            "max_resets": 4,
-            "seconds": 60.0,
-            "track": ["oval", "hills"],
-            "seed": 7,
-            "config": CAR,
-        },
-    }

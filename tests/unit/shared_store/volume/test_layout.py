@@ -1,16 +1,13 @@
-"""Where things lie on the shared volume, what may be used as one, and its tracks, which never change."""
+"""Where things lie on the shared volume, and what may be used as one."""
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 from pathlib import Path
 
 import pytest
 
-from racer.store import tracks
-from racer.store.tracks import TrackError
 from shared_store.volume.layout import FORMAT, Store, StoreError
 
 
@@ -85,65 +82,3 @@ def test_runs_keep_their_descriptions_and_are_listed_by_name_only_if_they_were_c
     (tmp_path / "runs" / "empty").mkdir()
     (tmp_path / "runs" / ".probe-1").write_text("")
     assert [run.name for run in store.runs()] == ["a", "b"]
-
-
-def test_a_track_is_kept_with_its_measures(store: Store) -> None:
-    assert tracks.names(store) == []
-    kept = tracks.add(store, "hills", b"rows", {"length": 40.0, "origin": {"seed": 7}})
-    assert (kept.name, kept.path, tracks.names(store)) == ("hills", store.path / "tracks" / "hills", ["hills"])
-    found = tracks.find(store, "hills")
-    facts = found.facts()
-    assert (facts["name"], facts["length"], facts["origin"]) == ("hills", 40.0, {"seed": 7}) and facts["created"] > 0
-    assert found.read() == b"rows"
-    assert all(file.stat().st_mode & 0o222 == 0 for file in kept.path.iterdir()), "nothing of it may be written"
-
-
-def test_a_track_is_never_changed(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    tracks.add(store, "hills", b"rows", {})
-    for _ in range(2):
-        with pytest.raises(TrackError, match="hills exists already, and tracks are immutable; choose another name"):
-            tracks.add(store, "hills", b"others", {})
-        monkeypatch.setattr(tracks, "names", lambda store: [])  # it looked before the other one was done
-    monkeypatch.undo()
-    assert tracks.find(store, "hills").read() == b"rows"
-    assert [path.name for path in store.tracks.iterdir()] == ["hills"], "nothing half made is left"
-
-
-@pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "random:7", "x" * 129])
-def test_a_name_that_can_be_no_directory_is_refused(store: Store, name: str) -> None:
-    with pytest.raises(TrackError, match="use letters, digits"):
-        tracks.add(store, name, b"rows", {})
-    assert not store.tracks.exists()
-
-
-def test_an_unknown_track_is_reported_with_the_nearest_name(store: Store) -> None:
-    with pytest.raises(TrackError, match="track hils does not exist; none is kept yet"):
-        tracks.find(store, "hils")
-    tracks.add(store, "hills", b"rows", {})
-    with pytest.raises(TrackError, match=r"track hils does not exist; did you mean hills\?"):
-        tracks.find(store, "hils")
-
-
-def test_a_track_that_was_altered_is_not_read(store: Store) -> None:
-    path = tracks.add(store, "hills", b"rows", {}).path
-    (path / "track.npy").chmod(0o644)
-    (path / "track.npy").write_bytes(b"ROWS")
-    said = r"track hills is damaged: .* track.npy was altered .*; delete .*hills and make or import it again"
-    with pytest.raises(TrackError, match=said):
-        tracks.find(store, "hills").read()
-    (path / "manifest.json").unlink()
-    with pytest.raises(TrackError, match=r"track hills is damaged: .* manifest.json is missing"):
-        tracks.find(store, "hills").facts()
-
-
-def test_links_out_of_the_store_are_not_followed(store: Store, tmp_path: Path) -> None:
-    path = tracks.add(store, "hills", b"rows", {}).path
-    shutil.move(path, tmp_path / "elsewhere")
-    os.symlink(tmp_path / "elsewhere", path)
-    for read in (tracks.StoredTrack(path).read, tracks.StoredTrack(path).facts):
-        with pytest.raises(TrackError, match="links inside a run are not followed"):
-            read()
-    shutil.rmtree(store.tracks)
-    os.symlink(tmp_path, store.tracks)
-    with pytest.raises(TrackError, match="links inside a run are not followed"):
-        tracks.add(store, "valleys", b"rows", {})

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from racer.store import leagues
 from shared_store.volume import contents, models, trash
 from shared_store.volume.bundles import seal
 from shared_store.volume.checkpoints import list_checkpoints
@@ -19,7 +18,6 @@ from shared_store.volume.layout import Run, Store
 from shared_store.volume.references import references
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.permissions import permissions_count
-from tests.support.shared_store.leagues import entry, league
 
 
 def logged(store: Store, name: str, job: str = "j1") -> Run:
@@ -183,11 +181,6 @@ def test_clones_pupils_models_and_entries_need_their_runs(store: Store) -> None:
     assert {("run", "heir", "model ant@1 is of it"), ("run", "source", "model ant@1 began with its weights")} <= needed(
         store
     )
-    cup = leagues.create(store, league())
-    cup.enter(entry("racer", "key a"))
-    cited = cup.entry(1)["evaluation"]
-    by = "entry 1 of league cup cites it"
-    assert {("run", cited["run"], by), ("job", cited["job"], by)} <= needed(store)
 
 
 def test_what_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> None:
@@ -196,12 +189,9 @@ def test_what_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> 
     (store.run("source").path / "run.json").write_text("{")
     write(store.models / "ant" / "1" / "model.json", "{")
     (store.models / "bee" / "1").mkdir(parents=True)
-    leagues.create(store, league())
-    write(store.path / "leagues" / "cup" / "entries" / "1" / "entry.json", "[]")
-    (store.path / "leagues" / "cup" / "entries" / "2").mkdir()
     found, unreadable = references(store)
     assert found == []
-    for part in ("run source", "model ant@1", "model bee@1", "entry 1 of league cup", "entry 2 of league cup"):
+    for part in ("run source", "model ant@1", "model bee@1"):
         assert any(part in each for each in unreadable), (part, unreadable)
 
 
@@ -214,11 +204,8 @@ def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
     write(store.run("pupil").path / "teachers" / "source" / "weights")
     for name in ("ant", "bee"):
         write_json(store.models / name / "1" / "model.json", {"run": "source"})
-    leagues.create(store, league())
-    write(store.path / "leagues" / "cup" / "entries" / "1" / "entry.json", "{}")
     closed = (
         store.models / "ant",
-        store.path / "leagues" / "cup" / "entries",
         store.run("hidden").path,
         store.run("pupil").path / "teachers",
     )
@@ -231,5 +218,5 @@ def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
     for path in (*closed, store.models):
         path.chmod(0o755)
     assert {each.by for each in found} == {"run child is a clone of it", "model bee@1 is of it"}
-    for part in ("model ant", "league cup", "run hidden", "run pupil"):
+    for part in ("model ant", "run hidden", "run pupil"):
         assert any(each.startswith(f"{part} can't be read ([Errno 13]") for each in unreadable), (part, unreadable)

@@ -19,10 +19,10 @@ REFERENCE = Reference("train.config.reward_function", "long.py", DIGEST)
 
 
 def spec(value: Any, section: str = "train") -> dict[str, Any]:
-    return {"name": "job", section: {"task": "Racer", "config": {"track": "oval", "reward_function": value}}}
+    return {"name": "job", section: {"task": "elsewhere.mine:Task", "config": {"level": 3, "reward_function": value}}}
 
 
-@pytest.mark.parametrize("section", ["train", "evaluate", "race"])
+@pytest.mark.parametrize("section", ["train", "evaluate"])
 def test_a_long_text_is_referred_to_and_a_short_one_stays(section: str) -> None:
     shortened, found = beside(spec(LONG, section))
     assert shortened == spec({"file": "long.py", "sha256": DIGEST}, section)

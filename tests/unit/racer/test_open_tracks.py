@@ -25,8 +25,8 @@ from racer.tracks.picture import picture_of
 from racer.tracks.route_file import from_bytes, to_bytes
 from racer.tracks.track import Track
 from shared_store.volume.layout import Store
+from tests.support.racer.racing import OVAL, known, open_track, straight
 from tests.support.refusals import refusal
-from tests.support.worker.racing import OVAL, known, open_track, straight
 
 HORSESHOE = open_track()
 END = HORSESHOE.length

@@ -24,7 +24,7 @@ from racer.tracks.road import road_arrays
 from racer.tracks.route_file import from_bytes, to_bytes
 from racer.tracks.track import Track
 from shared_store.volume.layout import Store
-from tests.support.worker.racing import known
+from tests.support.racer.racing import known
 
 
 def ring(radius: float, turned: float = 0.0, count: int = 120) -> np.ndarray:

@@ -15,7 +15,7 @@ from racer.rewards.problems import KINDS
 from racer.rewards.samples import Line, oval, samples
 from racer.rewards.translation import translate
 from tests.conftest import REPOSITORY
-from tests.support.worker.racing import round_the_guard
+from tests.support.racer.racing import round_the_guard
 
 HEAD = "def reward_function(params):\n    "
 

@@ -20,9 +20,9 @@ from racer.rewards.samples import oval, samples
 from racer.rewards.workers import Workers
 from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig, RewardFile
 from racer.tracks.geometry import on_road, project
+from tests.support.racer.racing import known, racer, round_the_guard
 from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
-from tests.support.worker.racing import known, racer, round_the_guard
 
 BOXES = (ObstacleConfig(1.5, "inner"), ObstacleConfig(6.0, "outer"), ObstacleConfig(9.0, "center"))
 STEER = """

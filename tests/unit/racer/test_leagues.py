@@ -17,8 +17,8 @@ from racer.store.standings import table
 from shared_store.volume.bundles import seal
 from shared_store.volume.files import write_json
 from shared_store.volume.layout import Store
+from tests.support.racer.leagues import CONFIG, entry, league, race, summary
 from tests.support.shared_store.at_once import at_once
-from tests.support.shared_store.leagues import CONFIG, entry, league, race, summary
 
 
 @pytest.fixture

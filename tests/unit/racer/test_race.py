@@ -23,8 +23,8 @@ from racer.store.races import race_changes, rules_of
 from racer.tracks.geometry import place_at, project
 from racer.tracks.naming import keep
 from shared_store.volume.layout import Run, Store
+from tests.support.racer.racing import OVAL, counted, known, open_track, racer, straight
 from tests.support.worker.loop import alone
-from tests.support.worker.racing import OVAL, counted, known, open_track, racer, straight
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.evaluation import result_of
 from worker.settings.overrides import configured

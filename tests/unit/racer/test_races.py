@@ -10,7 +10,7 @@ import pytest
 from racer.store.races import clock, key_of, race_changes, rules_of
 from racer.store.standings import BadRace, Contender, Race, Ranking, differences, read_race, table
 from shared_store.volume.evaluations import lines
-from tests.support.shared_store.leagues import race
+from tests.support.racer.leagues import race
 
 
 def test_a_race_is_three_laps_that_end_with_the_first_mishap_with_times_in_milliseconds() -> None:

@@ -23,8 +23,8 @@ from racer.tracks.naming import keep, resolve
 from racer.tracks.presets import make_preset
 from racer.tracks.track import Track
 from shared_store.volume.layout import Store
+from tests.support.racer.racing import OVAL, open_track, racer
 from tests.support.refusals import refusal
-from tests.support.worker.racing import OVAL, open_track, racer
 
 NEXT = """def reward_function(params):
     _, ahead = params["closest_objects"]

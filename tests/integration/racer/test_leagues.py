@@ -26,7 +26,7 @@ from shared_store.volume.models import Model
 from tests.conftest import Serving, call_muster
 from tests.support.orchestrator.jobs import FOREVER
 from tests.support.orchestrator.trained import SPEC, add_checkpoint, add_run
-from tests.support.shared_store.leagues import league, race, summary
+from tests.support.racer.leagues import league, race, summary
 
 TRAIN = {"task": "Racer", "worlds": 4, "iterations": 9}
 JOBS = 6

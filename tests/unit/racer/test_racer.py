@@ -17,8 +17,8 @@ from racer.tracks.generator import make_random
 from racer.tracks.geometry import on_road, place_at
 from racer.tracks.naming import keep
 from shared_store.volume.layout import Store
+from tests.support.racer.racing import OVAL, counted, known, racer, straight
 from tests.support.refusals import refusal
-from tests.support.worker.racing import OVAL, counted, known, racer, straight
 from worker.learning.job import configure
 from worker.learning.report import figures_of, shown_of
 from worker.settings.errors import UserError

@@ -17,7 +17,7 @@ from racer.tracks.generator import make_random
 from racer.tracks.geometry import advance, degrees, on_road, place_at, project
 from racer.tracks.presets import make_preset
 from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
-from tests.support.worker.racing import open_track
+from tests.support.racer.racing import open_track
 
 
 def square(side: float = 4.0, width: float = 1.0) -> Track:

@@ -19,7 +19,7 @@ from racer.rewards.problems import RewardFailed
 from racer.rewards.samples import OVAL, oval
 from racer.rewards.workers import Workers
 from tests.conftest import REPOSITORY
-from tests.support.worker.racing import round_the_guard
+from tests.support.racer.racing import round_the_guard
 
 MACHINE = os.uname().machine
 pytestmark = pytest.mark.skipif(MACHINE not in sandbox.MACHINES, reason="no list of this processor's system calls")
@@ -339,7 +339,7 @@ def test_a_process_that_answers_what_it_likes_is_bounded_and_says_no_more_than_a
 
 def outside(calls: str, body: str, run: str = "tried(BODY, anyway=True)") -> str:
     """What a function's trial says in a process on a kernel that lacks some calls; none given: all that the sandbox needs."""
-    code = f"from tests.unit.worker.racer.test_reward_sandbox import *\nBODY = {body!r}\nprint({run})"
+    code = f"from tests.unit.racer.test_reward_sandbox import *\nBODY = {body!r}\nprint({run})"
     command = [sys.executable, "-m", "tests.support.worker.kernel", calls or "landlock,unshare,seccomp", sys.executable]
     ended = subprocess.run([*command, "-c", code], cwd=REPOSITORY, capture_output=True, text=True, check=True)
     return ended.stdout.strip()
@@ -380,7 +380,7 @@ def test_there_a_job_s_node_runs_it_with_a_warning_and_the_controller_has_a_note
     source = "kept = []\ndef reward_function(params):\n    kept.append(1)\n    return params['speed']\n"
     code = f"""\
 import torch
-from tests.unit.worker.racer.test_reward_inputs import rewarded
+from tests.unit.racer.test_reward_inputs import rewarded
 from orchestrator.spec.file import from_text
 source = {source!r}
 task = rewarded(source, 2, track="oval")

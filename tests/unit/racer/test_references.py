@@ -1,0 +1,42 @@
+"""What the entries of leagues need of the store: the run that a race is cited of, and its job."""
+
+from __future__ import annotations
+
+from racer.store import leagues
+from shared_store.volume.layout import Store
+from shared_store.volume.references import references
+from tests.support.permissions import permissions_count
+from tests.support.racer.leagues import entry, league
+
+
+def test_an_entry_needs_the_run_and_the_job_of_the_race_that_it_cites(store: Store) -> None:
+    cup = leagues.create(store, league())
+    cup.enter(entry("racer", "key a"))
+    cited = cup.entry(1)["evaluation"]
+    found, unreadable = references(store)
+    by = "entry 1 of league cup cites it"
+    assert {(each.kind, each.name, each.by) for each in found} == {("run", cited["run"], by), ("job", cited["job"], by)}
+    assert unreadable == []
+
+
+def test_an_entry_that_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> None:
+    cup = leagues.create(store, league())
+    for number in ("1", "2"):
+        (cup.path / "entries" / number).mkdir(parents=True)
+    (cup.path / "entries" / "1" / "entry.json").write_text("[]")
+    found, unreadable = references(store)
+    assert found == []
+    for part in ("entry 1 of league cup", "entry 2 of league cup"):
+        assert any(part in each for each in unreadable), (part, unreadable)
+
+
+def test_a_league_that_can_t_be_read_hides_no_other(store: Store) -> None:
+    leagues.create(store, league("bowl")).enter(entry("racer", "key a"))
+    entries = leagues.create(store, league()).path / "entries"
+    entries.mkdir(exist_ok=True)
+    entries.chmod(0)
+    with permissions_count():
+        found, unreadable = references(store)
+    entries.chmod(0o755)
+    assert {each.by for each in found} == {"entry 1 of league bowl cites it"}
+    assert any(each.startswith("league cup can't be read ([Errno 13]") for each in unreadable), unreadable
