@@ -12,7 +12,8 @@ from typing import Any
 
 import torch
 
-from tests.conftest import PATIENCE, REPOSITORY
+from tests.conftest import REPOSITORY
+from tests.support.waiting import PATIENCE
 from tests.support.worker.tasks import play, same
 from worker.tasks import find_task
 from worker.tasks.run.task import Task
