@@ -25,8 +25,6 @@ from shared_store.volume.texts import digest_of
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
 
-_SUBMISSIONS = ("/submitjob", "/api/jobs", "/resume", "/clone", "/races")
-"""Paths of requests that must not be carried out twice."""
 _PAUSES = (0.2, 0.4, 0.8, 1.6, 0)
 """Seconds after each refusal for too many requests or connections; the last refusal is reported."""
 _BARREN = 4
@@ -100,7 +98,9 @@ class Client:
 
     def batch(self, operation: str, **request: Any) -> dict[str, Any]:
         """An AWS Batch operation, such as ``SubmitJob``, with its members as keywords. Raises ApiError, Unreachable."""
-        answer: dict[str, Any] = self._answer("POST", f"/v1/{operation.lower()}", request).json()
+        answer: dict[str, Any] = self._answer(
+            "POST", f"/v1/{operation.lower()}", request, once=operation == "SubmitJob"
+        ).json()
         return answer
 
     def get(self, path: str, *, seconds: float = 30, **query: Any) -> Any:
@@ -108,9 +108,12 @@ class Client:
         known = {key: value for key, value in query.items() if value is not None}
         return self._answer("GET", path, query=known, seconds=seconds).json()
 
-    def post(self, path: str, body: dict[str, Any], *, seconds: float = 30) -> Any:
-        """POST to a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
-        return self._answer("POST", path, body, seconds=seconds).json()
+    def post(self, path: str, body: dict[str, Any], *, seconds: float = 30, once: bool = False) -> Any:
+        """POST to a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable.
+
+        ``once``: it submits a job, and is sent again under the same idempotency key where the answer was lost.
+        """
+        return self._answer("POST", path, body, seconds=seconds, once=once).json()
 
     def delete(self, path: str, *, seconds: float = 30) -> Any:
         """DELETE of a native path, waiting up to ``seconds`` for the answer. Raises ApiError, Unreachable."""
@@ -197,10 +200,10 @@ class Client:
         query: dict[str, Any] | None = None,
         seconds: float = 30,
         content: bytes | None = None,
+        once: bool = False,
     ) -> httpx.Response:
-        """``body``: JSON; ``content``: a body as it is."""
-        is_submission = method == "POST" and path.endswith(_SUBMISSIONS)
-        headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if is_submission else {}
+        """``body``: JSON; ``content``: a body as it is; ``once``: as of :meth:`post`."""
+        headers = {"X-Muster-Idempotency-Key": uuid.uuid4().hex} if once else {}
 
         def send() -> httpx.Response:
             for pause in _PAUSES:

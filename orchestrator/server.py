@@ -42,9 +42,11 @@ from orchestrator.home import HomeLock, console_secret
 from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError
+from orchestrator.plugins import add_plugins
 from orchestrator.services import arns
 from orchestrator.services.automatic_evaluations import AutomaticEvaluations
 from shared_store.volume.layout import Store
+from shared_store.volume.plugin_folders import note_plugins
 
 log = logging.getLogger("muster.controller")
 
@@ -126,6 +128,7 @@ class Server:
                 stack.enter_context(_default_store(home / "store"))
             self.store = Store(store or home / "store")
             self.store.check_writable()
+            note_plugins(self.store)
             try:
                 found = Database(_database_url(database)) if database else Database.at(home)
                 stack.callback(found.close)
@@ -168,6 +171,7 @@ class Server:
             stack.callback(self.deliveries.close)
             self._opened = stack.pop_all()
         self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
+        add_plugins(self.app)
         add_console(self.app)
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(

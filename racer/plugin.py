@@ -37,14 +37,14 @@ PLUGIN = Plugin(
             "Manage the racer's leagues: create, submit, table, verify and more. Leagues are append-only.",
         ),
     ),
-    options=(("evaluate", "racer.control.evaluate_options:add"),),
+    options=(("evaluate", "racer.control.evaluate_options:OPTIONS"),),
     sections=(
         JobSection(
             key="race",
-            plural="races",
+            verb="races",
             model="racer.control.race_section:Race",
             rank="racer.race",
-            rules="racer.store.races:RULES",
+            rules="racer.race.rules:RULES",
             watcher="racer.race.trials:Laps",
         ),
     ),

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from racer.store.races import NO_RACER, TRIALS, race_changes, rules_of
+from shared_store.contract import plugins
 from shared_store.volume.outcomes import EX_TEMPFAIL
 from shared_store.volume.run_settings import merged
 from shared_store.volume.texts import beside, keep
@@ -16,7 +16,8 @@ from worker.learning.job import Job, StopRequest, configure, end_startup, run_co
 from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
-    from racer.race.trials import Laps
+    from shared_store.contract.plugins import EvaluationRules
+    from worker.evaluation.evaluation import Watcher
     from worker.tasks.run.task import Task
 
 EPISODES = 100
@@ -28,12 +29,13 @@ def main(kind: str = "evaluate") -> int:
     """Evaluate; returns the exit code: 0 done, 75 left on request (started again, it begins anew).
 
     Args:
-        kind: The section of the job: ``evaluate``, or ``race`` of a job whose episodes are the laps of a race.
+        kind: The key of the job's section: ``evaluate``, or that of a plug-in's, whose rules say how many episodes there are.
     """
     stop = StopRequest().listen()  # before the imports, which take seconds
     job = Job.from_env(os.environ, kind)
-    run, race = job.named_run(), kind == "race"
-    episodes = job.setting("trials", TRIALS) if race else job.setting("episodes", EPISODES)
+    run, section = job.named_run(), plugins.sections().get(kind)
+    rules: EvaluationRules | None = plugins.load(section.rules) if section else None
+    episodes = job.setting(*rules.count if rules else ("episodes", EPISODES))
     from worker.learning.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
@@ -56,13 +58,13 @@ def main(kind: str = "evaluate") -> int:
     with user_errors("task"):
         task_type = find_task(facts["task"])
     changes = job.section.get("config") or {}
-    if race:
-        changes = _race_changes(job, task_type, gang.size)
+    if rules:
+        changes = _changes(rules, job, kind, task_type, gang.size)
     trained = facts["train"]
     config = configure(task_type, {**trained, "config": merged(trained.get("config") or {}, changes)}, kind)
     seed = job.setting("seed", held_out_seed(trained.get("seed", 0)), least=0)
     seed_generators(seed)
-    size = episodes if race else SIZE  # each lap of a race in a world, and no further ones beside them
+    size = episodes if rules else SIZE  # by rules, each episode has a world, and there are no further ones beside them
     blocks = math.ceil(min(job.setting("worlds", WORLDS) * gang.size, episodes) / size)
     dealt = Share.of(gang.rank, gang.size, max(blocks, gang.size))
     share, total = Share(dealt.first * size, dealt.count * size, dealt.total * size), dealt.total * size
@@ -82,8 +84,8 @@ def main(kind: str = "evaluate") -> int:
     end_startup()
     started = time.perf_counter()
     rounds = _rounds(task, build, math.ceil(episodes / total), total, seed)
-    laps = _laps(task) if race else None
-    look = laps.note if laps else None
+    watcher: Watcher | None = plugins.load(section.watcher)(task) if section else None
+    look = watcher.note if watcher else None
     try:
         played = play(rounds, policy, gang, episodes=episodes, is_asked_to_stop=lambda: stop.requested, look=look)
     except Stopped:
@@ -94,15 +96,15 @@ def main(kind: str = "evaluate") -> int:
         return EX_TEMPFAIL
     result = result_of(task, played, checkpoint.name, seed, started)
     if gang.is_main:
-        if not laps:
+        if not watcher:
             print(result, flush=True)
         known = {"keep": job.section.get("keep", True), **_circumstances(facts)}
-        driven = laps.race(played, rules_of(job.section), seed, facts) if laps else None
+        judged = {kind: watcher.result(played, job.section, seed, facts)} if watcher else {}
         shown, texts = beside({kind: {"config": changes}})
         for text in texts.values():  # such as a reward function, which explains this evaluation later
             keep(run.texts, text.encode())
         summary = result.write(
-            run, job.id, driven, iteration=checkpoint.iteration, config=shown[kind]["config"], **known
+            run, job.id, judged, iteration=checkpoint.iteration, config=shown[kind]["config"], **known
         )
         print("\n".join(lines(summary)), flush=True)
         print(f"written: {run.evaluations / summary['table']} and .json", flush=True)
@@ -110,21 +112,16 @@ def main(kind: str = "evaluate") -> int:
     return 0
 
 
-def _race_changes(job: Job, task_type: type[Task], ranks: int) -> dict[str, Any]:
-    """The race's changes to the training's configuration. Raises UserError for a task without laps, and for several ranks."""
-    if not task_type.config_type.races:
-        raise UserError(f"race: run {job.section.get('run')} trained {task_type.__name__}, {NO_RACER}")
+def _changes(rules: EvaluationRules, job: Job, kind: str, task_type: type[Task], ranks: int) -> dict[str, Any]:
+    """The section's changes to the training's configuration. Raises UserError for a task that has no such evaluations, and for several
+    ranks."""
+    if words := rules.refusal(task_type.config_type):
+        raise UserError(f"{kind}: run {job.section.get('run')} trained {task_type.__name__}, {words}")
     if ranks > 1:
-        raise UserError(f"race: it runs on one node with at most one GPU, not on {ranks} ranks")
+        raise UserError(f"{kind}: it runs on one node with at most one GPU, not on {ranks} ranks")
     if not isinstance(job.section.get("config") or {}, dict):
-        raise UserError("race.config: expected a mapping")
-    return race_changes(job.section)
-
-
-def _laps(task: Any) -> Laps:
-    from racer.race.trials import Laps
-
-    return Laps(task)
+        raise UserError(f"{kind}.config: expected a mapping")
+    return rules.changes(job.section)
 
 
 def _rounds(task: Task, build: Callable[[int], Task], count: int, total: int, seed: int) -> Iterator[Task]:

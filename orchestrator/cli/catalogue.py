@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
+import inspect
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any
 
 import typer
+from typer.models import CommandInfo
 
 from orchestrator.cli.misuse import Group
+from shared_store.contract.plugins import Command, plugins
+from shared_store.contract.plugins import load as load_part
 
 
-class Entry(NamedTuple):
-    """A command, or a group of commands, in `muster --help`."""
-
-    name: str
-    module: str
-    """Module in ``orchestrator.cli``; its function ``register`` adds the command to an application."""
-    panel: str
-    summary: str
-    """The first line of the command's own help."""
+def Entry(name: str, module: str, panel: str, summary: str) -> Command:
+    """A command of Muster; ``module``: in ``orchestrator.cli``."""
+    return Command(name, f"orchestrator.cli.{module}", panel, summary)
 
 
 _JOBS, _RUNS, _SHARED, _HERE = "Jobs", "Runs", "Controller", "This machine"
@@ -101,13 +101,6 @@ ENTRIES = (
         "List the installed tasks, or all terms and numbers of one task.",
     ),
     Entry("robot", "robot", _HERE, "Show a robot's file as a task would load it, beside MuJoCo's own reading."),
-    Entry("tracks", "tracks", _SHARED, "Manage the racer's tracks: list, show, make, import. Tracks are immutable."),
-    Entry(
-        "league",
-        "league",
-        _SHARED,
-        "Manage the racer's leagues: create, submit, table, verify and more. Leagues are append-only.",
-    ),
     Entry("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors, or of the policy contract."),
     Entry(
         "doctor",
@@ -115,7 +108,39 @@ ENTRIES = (
         _HERE,
         "Check whether this machine meets Muster's requirements; exit 1 if a requested part is missing.",
     ),
+    *(command for plugin in plugins().values() for command in plugin.commands),
 )
+
+
+@dataclass(frozen=True)
+class FurtherOptions:
+    """Options that a plug-in adds to a command.
+
+    Attributes:
+        function: Called in the command's place with its function, its values by their names, and the values of the further options,
+            which are the keyword-only parameters of ``function``.
+        examples: Lines for the end of the command's help.
+    """
+
+    function: Callable[..., Any]
+    examples: str
+
+    def extend(self, command: CommandInfo) -> None:
+        """Add the options to a command."""
+        own, function = command.callback, self.function
+        assert own is not None
+        first, second = (inspect.signature(each, eval_str=True) for each in (own, function))
+        added = [each for each in second.parameters.values() if each.kind is inspect.Parameter.KEYWORD_ONLY]
+
+        def both(**given: Any) -> Any:
+            further = {each.name: given.pop(each.name) for each in added}
+            return function(own, given, **further)
+
+        both.__name__, both.__doc__, both.__annotations__ = own.__name__, own.__doc__, {}
+        both.__signature__ = first.replace(parameters=[*first.parameters.values(), *added])  # type: ignore[attr-defined]
+        command.callback, command.epilog = both, f"{command.epilog}\n{self.examples}"
+
+
 _LINE_END = re.compile(r"(?<!\n)\n(?!\n)")
 """Marks a line that is not the last of its paragraph."""
 _MODULES = {entry.name: entry.module for entry in ENTRIES}
@@ -124,7 +149,9 @@ _MODULES = {entry.name: entry.module for entry in ENTRIES}
 def load(name: str) -> Any:
     """The command itself. Imports its module."""
     own = typer.Typer(rich_markup_mode="rich")
-    import_module(f"orchestrator.cli.{_MODULES[name]}").register(own)
+    import_module(_MODULES[name]).register(own)
+    for place in (place for plugin in plugins().values() for extended, place in plugin.options if extended == name):
+        load_part(place).extend(own.registered_commands[0])
     command: Any = typer.main.get_group(own).commands[name]
     for each in (command, *getattr(command, "commands", {}).values()):
         # a docstring's line breaks are the source's; the terminal's width decides on its own

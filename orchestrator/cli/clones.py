@@ -74,7 +74,7 @@ def clone(
             "directory": os.getcwd(),
             "dry_run": dry_run,
         }
-        cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300)
+        cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300, once=True)
         if dry_run:
             show_plan(client, cloned["definition"], cloned["queue"], as_json)
             return

@@ -41,7 +41,7 @@ def gc(
 
     A job goes by the rule of its queue (tag muster:retention, such as 30d), else by `muster serve --retention`; of queues without a rule
     only jobs of the Batch API go, 90 days after their end. Never deleted: runs with checkpoints or any other results, parents of clones,
-    teachers, runs of models and of entries of leagues, runs that an unfinished job uses, and archived runs (`muster runs archive`). Your
+    teachers, runs of models and of what plug-ins keep, runs that an unfinished job uses, and archived runs (`muster runs archive`). Your
     key deletes what is yours; a key with all queues deletes everything.
     """
     with Client.connect() as client:

@@ -86,7 +86,7 @@ def submit_spec(
             client.keep_text(text)
     body = {"spec": document, "directory": os.getcwd(), "environment": dict(environment or {})}
     try:
-        answer: dict[str, Any] = client.post("/api/jobs", body, seconds=60)
+        answer: dict[str, Any] = client.post("/api/jobs", body, seconds=60, once=True)
     except ApiError as error:
         if error.status == 400:
             raise SpecError(f"{source}: {error}") from None

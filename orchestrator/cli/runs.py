@@ -65,7 +65,7 @@ def resume(
             ],
             "directory": os.getcwd(),
         }
-        resumed = client.post(f"/api/runs/{named(run)}/resume", body)
+        resumed = client.post(f"/api/runs/{named(run)}/resume", body, once=True)
         if as_json:
             echo_json(resumed)
         else:

@@ -16,16 +16,17 @@ from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.installed import traits_of
 from shared_store.contract.error_text import counted
 from shared_store.contract.phases import phase_in
+from shared_store.contract.plugins import sections
 from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.learning_metrics import in_words
 from shared_store.volume.metrics import warnings_of
 
 _OF_RUN = {
     "evaluate": "evaluates",
-    "race": "races",
     "export": "exports",
     "record": "records",
     "render": "renders",
+    **{key: section.verb for key, section in sections().items()},
 }
 """Verb for what a job of each kind does with another run."""
 _CHILDREN = 20

@@ -98,8 +98,8 @@ def delete(
 ) -> None:
     """Delete a run with its checkpoints, logs and results, for good.
 
-    It is refused while something needs the run: an unfinished job, a clone, a pupil, a model, or an entry of a league. The jobs of the run
-    stay in the history.
+    It is refused while something needs the run: an unfinished job, a clone, a pupil, a model, or what a plug-in keeps, such as an entry of
+    a league. The jobs of the run stay in the history.
     """
     with Client.connect() as client:
         if not yes:

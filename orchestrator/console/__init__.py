@@ -55,9 +55,7 @@ PAGES = (
     "compare",
     "keys",
     "submit",
-    "tracks",
     "models",
-    "leagues",
 )
 """Modules of this package, each with a ``router``."""
 

@@ -28,7 +28,7 @@ _MOST_LINES = 1000
 
 
 def code_of(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Name and text of each file that the job holds, such as a racer's reward function."""
+    """Name and text of each file that the job holds, such as a reward function."""
     found: list[tuple[str, str]] = []
     for value in spec.values():
         if isinstance(value, Mapping):

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +20,7 @@ from orchestrator.console import assets
 from orchestrator.console import formats as words
 from orchestrator.services.permissions import Actor
 from shared_store import __version__
+from shared_store.contract.plugins import plugins
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; frame-src 'self'; "
@@ -47,15 +50,22 @@ NAVIGATION = (
     Entry("Jobs", "/"),
     Entry("Runs", "/runs"),
     Entry("Models", "/models"),
-    Entry("League", "/leagues"),
-    Entry("Tracks", "/tracks"),
+    *(Entry(label, path) for plugin in plugins().values() for label, path in plugin.navigation),
     Entry("Queues & compute", "/queues"),
     Entry("Keys", "/keys"),
     Entry("Submit", "/submit"),
 )
 
+
+def _added_templates() -> Iterator[Path]:
+    """The folders of plug-ins' templates."""
+    for package in (plugin.templates for plugin in plugins().values() if plugin.templates):
+        for place in import_module(package).__path__:
+            yield Path(place) / "templates"
+
+
 templates = Environment(
-    loader=FileSystemLoader(Path(__file__).parent / "templates"),
+    loader=FileSystemLoader([Path(__file__).parent / "templates", *_added_templates()]),
     autoescape=select_autoescape(default=True, default_for_string=True),
     undefined=StrictUndefined,
     trim_blocks=True,

@@ -1,4 +1,4 @@
-"""Submitting a job: a wizard for a task or the racer, plain YAML, and a review of both before anything is submitted."""
+"""Submitting a job: a wizard for a task, plain YAML, and a review of both before anything is submitted."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from orchestrator.console.forms import TOKEN, Form, done, sent_form
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.console.submit_fields import Group, document, filled, groups, races, tasks, written
+from orchestrator.console.submit_fields import Group, document, filled, form_of, forms, groups, tasks, written
 from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services import permissions
@@ -31,7 +31,6 @@ from orchestrator.services.texts import with_texts
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
-from racer.control.track_pages import track_names
 from shared_store.contract.error_text import nearest
 
 router, _stored = page_router(), page_router(stored=True)
@@ -47,10 +46,10 @@ train:
   iterations: 100
 """
 _LARGEST = 192 << 10
-"""Bytes of a form's YAML: of a reward function, which has at most 140,000 characters, with its indentation, and of the rest of the job."""
+"""Bytes of a form's YAML: of a file's text of at most 140,000 characters, with its indentation, and of the rest of the job."""
 _sent = Recent(inf, 1000)
 """Id and name of the jobs of the last forms, by sender and the form's random name: a form that is sent again makes no second job."""
-_turns = Turns("other reward functions are being tried")
+_turns = Turns("the files of other jobs are being tried")
 """Each is tried in a process of its own."""
 _checks = Turns("other jobs are being checked")
 
@@ -60,9 +59,11 @@ def choose(request: Request) -> Response:
     """The page on which the task is chosen."""
     actor = actor_of(request)
     actor.check(Operation.SUBMIT_JOB)
-    racers = {name: about for name, about in tasks().items() if races(name)}
-    others = {name: about for name, about in tasks().items() if name not in racers}
-    return render(request, "submit.html", racers=racers, tasks=others)
+    kinds: dict[str, dict[str, str]] = {title: {} for title in (*(form.title for form in forms()), "Train a task")}
+    for name, about in tasks().items():
+        form = form_of(name)
+        kinds[form.title if form else "Train a task"][name] = about
+    return render(request, "submit.html", kinds=kinds)
 
 
 @_stored.get("/submit/task/{task}")
@@ -97,7 +98,7 @@ def plain_again(request: Request, form: Form = Depends(sent_form)) -> Response:
 
 @router.post("/submit/check")
 def check(request: Request, form: Form = Depends(sent_form)) -> Response:
-    """The YAML of the filled fields, its problem, and help for a line; ``whole`` also tries a reward function."""
+    """The YAML of the filled fields, its problem, and help for a line; ``whole`` also tries the texts of files."""
     actor = actor_of(request)
     actor.check(Operation.SUBMIT_JOB)
     text, _ = _text(request, form)
@@ -193,8 +194,8 @@ def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
 def _checked(request: Request, text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
     """The spec of a text, or its problem.
 
-    A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys the text of a reward function
-    is checked here, and the job's ranks try it.
+    A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys its text is checked here, and
+    the job's ranks try it.
     """
     actor = actor_of(request)
     tries = whole and actor.queues is None
@@ -236,7 +237,8 @@ def _wizard(
 ) -> Response:
     actor = actor_of(request)
     text = written(document(task, found))
-    there, missing = track_names(request) if races(task) else ([], "")
+    form = form_of(task)
+    there, missing = form.names(request) if form else ([], "")
     names = [each.name for group in found for each in group.fields]
     return render(
         request,
@@ -246,8 +248,8 @@ def _wizard(
         about=tasks()[task],
         groups=found,
         text=text,
-        tracks=there,
-        no_tracks=missing,
+        names=there,
+        missing=missing,
         problem=problem,
         wrong_name=_nearest_field(problem.key, names) if problem else "",
         tries=actor.queues is None,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
 import yaml
+from fastapi import Request
 
 from orchestrator.console.forms import Form
 from orchestrator.spec import strict_yaml
@@ -18,16 +19,8 @@ from orchestrator.spec.model import ALGORITHMS
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import known_tasks
 from shared_store.contract.file_fields import kept_files
+from shared_store.contract.plugins import load, plugins
 
-CODE = "reward_function.py"
-"""Name of the code in the wizard's editor, as messages give it."""
-EXAMPLE = '''def reward_function(params):
-    """Keep to the middle of the road, and drive fast."""
-    if not params["all_wheels_on_track"]:
-        return 1e-3
-    middle = 1.0 - (2.0 * params["distance_from_center"] / params["track_width"]) ** 2
-    return max(1e-3, middle) * params["speed"]
-'''
 _JOB = ("name", "queue", "nodes", "resources.cpus", "resources.gpus", "resources.memory")
 _TRAINING = ("train.worlds", "train.iterations", "train.seed", "train.algorithm")
 _MORE = (
@@ -46,8 +39,9 @@ class Field:
 
     name: str
     """The key path in the YAML."""
-    kind: Literal["text", "value", "choice", "code", "tracks"] = "value"
-    """``text``: as it stands; ``value``: read as YAML; ``choice``: one of the options; ``code``: a file's text; ``tracks``: names."""
+    kind: Literal["text", "value", "choice", "code", "names"] = "value"
+    """``text``: as it stands; ``value``: read as YAML; ``choice``: one of the options; ``code``: a text of several lines; ``names``: names,
+    one a line."""
     options: tuple[str, ...] = ()
     value: str = ""
     placeholder: str = ""
@@ -55,6 +49,10 @@ class Field:
     required: bool = False
     is_text: bool = False
     """Whether an option is a text, and not a value of YAML."""
+    file: str = ""
+    """The name of the file whose text a ``code`` is; empty where it is a value of YAML."""
+    picture: str = ""
+    """Address of a name's picture, in which ``{}`` is the name."""
 
     @property
     def label(self) -> str:
@@ -71,6 +69,33 @@ class Group:
     algorithm: str = ""
     """The algorithm without which the group is left out; empty for all."""
     hint: str = ""
+
+
+@dataclass(frozen=True)
+class TaskForm:
+    """The part of the wizard that a plug-in adds for its tasks."""
+
+    title: str
+    """Of these tasks, where one is chosen."""
+    includes: Callable[[str], bool]
+    """Whether a task is one of them."""
+    groups: Callable[[str], list[Group]]
+    """Further fields of a task, which stand before those of its schema."""
+    keys: frozenset[str]
+    """The keys of the task's configuration that they give."""
+    names: Callable[[Request], tuple[list[str], str]]
+    """What a field of kind ``names`` chooses from; where there is none, the reason."""
+
+
+def form_of(task: str) -> TaskForm | None:
+    """The form that a plug-in has for a task."""
+    return next((form for form in forms() if form.includes(task)), None)
+
+
+@cache
+def forms() -> Sequence[TaskForm]:
+    """Those of all plug-ins."""
+    return [load(place) for plugin in plugins().values() for place in plugin.forms]
 
 
 @cache
@@ -114,15 +139,9 @@ def _sentence(text: str) -> str:
     return line.partition(" Rewards: see")[0]
 
 
-@cache
-def races(task: str) -> bool:
-    """Whether a task drives on tracks."""
-    kind = task_config(task)
-    return kind is not None and bool(kind.races)
-
-
 def groups(task: str, queues: Sequence[str]) -> list[Group]:
     """The wizard's fields for a task. ``queues``: those to which the caller may submit."""
+    form = form_of(task)
     named = {"name": re.sub(r"[^A-Za-z0-9_-]", "-", task).strip("-").lower(), **_FIRST}
     own = {"queue": tuple(queues), "train.algorithm": tuple(ALGORITHMS)}
     chosen = {"queue": "default" if "default" in queues else next(iter(queues), ""), "train.algorithm": "ppo"}
@@ -137,40 +156,19 @@ def groups(task: str, queues: Sequence[str]) -> list[Group]:
         )
 
     found = [Group("Job", job(*_JOB), True), Group("Training", job(*_TRAINING), True)]
-    found += _racer(task) if races(task) else []
+    found += form.groups(task) if form else []
     config = config_schema(task)
     if config is None:
         hint = "This task publishes no schema; its ranks check the settings."
         found.append(Group("Configuration of the task", (Field("train.config", hint="YAML"),), hint=hint))
     else:
-        left_out = {*kept_files(task_config(task)), *(("track",) if races(task) else ())}
+        left_out = {*kept_files(task_config(task)), *(form.keys if form else ())}
         found += _groups("Task", config["properties"], "train.config", left_out)
     for name in ALGORITHMS:
         section = job_schema()["$defs"][f"Settings_{name}"]
         hint = "Empty fields keep the task's own values."
         found += _groups(f"Algorithm {name}", section["properties"], f"train.{name}", (), name, hint)
     return [*found, Group("More", job(*_MORE))]
-
-
-def _racer(task: str) -> list[Group]:
-    """The further fields of a racer's task: track, action space, reward function, hyperparameters."""
-    kind = task_config(task)
-    assert kind is not None
-    space = json.dumps(kind().action_space, indent=1, default=dict)
-    hint = (
-        "In degrees and m/s, as in DeepRacer's model_metadata.json: continuous ranges, or a list of discrete actions."
-    )
-    tracks = Field("train.config.track", "tracks", value="oval", hint="With several, the worlds take turns.")
-    reward = Field("train.config.reward_function", "code", value=EXAMPLE)
-    names = [Field(f"train.hyperparameters.{each}") for each in kind.hyperparameters]
-    theirs = "DeepRacer's names; they become settings of the algorithm, so give each in one place."
-    told = "Python, as DeepRacer has it: def reward_function(params). Empty: the rewards of the task."
-    return [
-        Group("Track", (tracks,), True),
-        Group("Action space", (Field("train.config.action_space", "code", value=space),), True, hint=hint),
-        Group("Reward function", (reward,), True, hint=told),
-        Group("Hyperparameters", tuple(names), hint=theirs),
-    ]
 
 
 def _at(path: str) -> Mapping[str, Any]:
@@ -232,7 +230,7 @@ def filled(form: Form, found: Sequence[Group]) -> list[Group]:
         replace(
             group,
             fields=tuple(
-                replace(each, value="\n".join(form.every(each.name)) if each.kind == "tracks" else _given(form, each))
+                replace(each, value="\n".join(form.every(each.name)) if each.kind == "names" else _given(form, each))
                 for each in group.fields
             ),
         )
@@ -259,11 +257,11 @@ def document(task: str, found: Sequence[Group]) -> dict[str, Any]:
 
 def _value(field: Field) -> Any:
     text = field.value
-    if field.kind == "tracks":
+    if field.kind == "names":
         names = [line.strip() for line in text.splitlines() if line.strip()]
         return names[0] if len(names) == 1 else names
-    if field.kind == "code" and field.name.endswith("reward_function"):
-        return {"file": CODE, "text": text if text.endswith("\n") else text + "\n"}
+    if field.file:
+        return {"file": field.file, "text": text if text.endswith("\n") else text + "\n"}
     if field.kind == "text" or field.is_text:
         return text.strip()
     if _NUMBER.fullmatch(text.strip()):

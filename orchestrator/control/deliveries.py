@@ -31,6 +31,7 @@ from orchestrator.persistence.ownership import is_of_earlier_run
 from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
 from shared_store.contract.error_text import nearest
+from shared_store.contract.plugins import evaluating
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.evaluations import by_checkpoint, evaluation_name, list_evaluations
 from shared_store.volume.layout import Run
@@ -247,7 +248,7 @@ def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None
     if kind_of(job) == "train" and is_of_earlier_run(job, run):
         return None, None
     with suppress(OSError, ValueError):  # a volume that is away: the message does without
-        if kind_of(job) in ("evaluate", "race"):
+        if kind_of(job) in evaluating():
             own = (
                 each for each in list_evaluations(run) if each["name"] == evaluation_name(each["checkpoint"], job.id)
             )

@@ -62,6 +62,12 @@ def _bytes(secret: str) -> bytes:
     return base64.b64decode(secret.removeprefix(_PREFIX), validate=True)
 
 
+def _kind(value: str) -> str:
+    if value not in KINDS:
+        raise ValueError(f"expected one of {', '.join(KINDS)}")
+    return value
+
+
 class Webhook(BaseModel):
     """One receiver."""
 
@@ -72,7 +78,7 @@ class Webhook(BaseModel):
     statuses: list[Literal["SUCCEEDED", "FAILED"]] = Field(default=["SUCCEEDED", "FAILED"], min_length=1)
     queues: list[str] | None = None
     """Names of job queues; None: all."""
-    kinds: list[Literal["train", "evaluate", "race", "export", "record", "render", "command"]] | None = None
+    kinds: list[Annotated[str, AfterValidator(_kind)]] | None = None
     """Of :data:`orchestrator.spec.model.KINDS`; None: all."""
     link: Annotated[str, AfterValidator(_url)] | None = None
     """URL at which the receiver's people reach this controller; None: the address at which it listens."""
@@ -110,7 +116,7 @@ def kind_of(job: Job) -> str:
 
 
 def run_of(job: Job) -> str:
-    """The run that a job trains, or of which it evaluates, races, exports, records or renders a checkpoint."""
+    """The run that a job trains, or of which it evaluates, exports, records or renders a checkpoint."""
     section = _spec(job).get(kind_of(job))
     named = section.get("run") if isinstance(section, dict) else None
     return named if isinstance(named, str) and NAME.fullmatch(named) else job.run

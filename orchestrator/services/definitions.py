@@ -14,7 +14,7 @@ from orchestrator.services.permissions import Operation
 from orchestrator.services.texts import check_texts
 
 
-def register(
+def revision(
     context: Context,
     name: str,
     document: Mapping[str, Any],
@@ -23,7 +23,7 @@ def register(
     *,
     again: bool = True,
 ) -> JobDefinition:
-    """Register a definition; nothing is committed.
+    """A revision of a definition, to be added to the session.
 
     Args:
         context: The call.
@@ -45,7 +45,7 @@ def register(
         if own and own.status == "ACTIVE" and own.document == document and own.tags == (tags or {}):
             return own
     newest = context.session.scalars(of_name).first()
-    added = JobDefinition(
+    return JobDefinition(
         name=name,
         revision=newest.revision + 1 if newest else 1,
         document=dict(document),
@@ -53,5 +53,3 @@ def register(
         status="ACTIVE",
         tags=dict(tags or {}),
     )
-    context.session.add(added)
-    return added

@@ -1,25 +1,30 @@
-"""Checks of the run of an evaluation or a race, before its job exists."""
+"""Checks of the checkpoint that a job evaluates, before the job exists."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import choose, refusal
+from orchestrator.services.stored_names import check_names
 from orchestrator.spec.settings import task_config
-from racer.control.racing_tracks import check_names
-from racer.store.races import NO_RACER, key_of, race_changes
+from shared_store.contract import plugins
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.run_settings import merged
 
+if TYPE_CHECKING:
+    from shared_store.contract.plugins import EvaluationRules
+
 
 def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str = "evaluate") -> Checkpoint | None:
-    """The checkpoint that the section ``evaluate`` or ``race`` of a spec means; None where the section is none, which the rank refuses.
+    """The checkpoint that a section of a spec evaluates; None where the section is none, which the rank refuses.
 
-    Raises ClientError: there is no such checkpoint, it can't be read, its task drives no laps of a race, refuses the changes, or
-    has no such track.
+    Raises ClientError: there is no such checkpoint, it can't be read, the section's rules are not for its task, or the task refuses
+    the changes, or names something that the store does not have.
+
+    ``key``: of the section, one of :func:`shared_store.contract.plugins.evaluating`.
     """
     section = spec.get(key)
     if not isinstance(section, dict):
@@ -37,16 +42,19 @@ def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str =
     task, trained = facts.get("task"), facts.get("train")
     kind = task_config(task) if isinstance(task, str) else None
     before = trained.get("config") if isinstance(trained, dict) else None
-    if key == "race":
-        if kind is not None and not kind.races:
-            raise ClientError(f"race: run {run.name} trained {task}, {NO_RACER}")
-        changes = race_changes(section)
+    added = plugins.sections().get(key)
+    rules: EvaluationRules | None = plugins.load(added.rules) if added else None
+    if rules:
+        if kind is not None and (words := rules.refusal(kind)):
+            raise ClientError(f"{key}: run {run.name} trained {task}, {words}")
+        changes = rules.changes(section)
+
+    def named(path: tuple[str | int, ...]) -> str:
+        return rules.key_of(section, path) if rules else ".".join(map(str, (key, "config", *path)))
+
     if changes and kind is not None:
-        problem = kind.problem_with(merged(before if isinstance(before, dict) else {}, changes))
-        if problem:
+        if problem := kind.problem_with(merged(before if isinstance(before, dict) else {}, changes)):
             path, words = problem
-            named = key_of(section, path) if key == "race" else ".".join(map(str, ("evaluate", "config", *path)))
-            raise ClientError(f"{named}: {words}")
-        if kind.races:
-            check_names(store, changes.get("track"), "race.track" if section.get("track") else f"{key}.config.track")
+            raise ClientError(f"{named(path)}: {words}")
+        check_names(store, kind, changes, lambda each: named((each,)))
     return chosen

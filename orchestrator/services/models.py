@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Literal
 
 from orchestrator.control.controller import Controller
@@ -77,9 +76,8 @@ def find_model(controller: Controller, actor: Actor, name: str, version: int | N
         raise ClientError(str(error)) from None
 
 
-def entered_model(controller: Controller, entry: Mapping[str, Any]) -> Model:
-    """The model of a league's entry, which every key may see with its league. Raises ClientError."""
-    name, version = entry["model"]["name"], entry["model"]["version"]
+def any_model(controller: Controller, name: str, version: int) -> Model:
+    """A version of a model, whoever may see it: something else that the caller may see cites it. Raises ClientError."""
     try:
         return next(model for model in models.versions(controller.access.store, name) if model.version == version)
     except StopIteration:

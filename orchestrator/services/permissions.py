@@ -1,7 +1,7 @@
 """Permissions: every operation of the API is decided here, for every kind of key and every object.
 
 A key either writes or only reads (``--read-only``), and either has all queues or some (``--queue``). An object belongs to a queue
-(a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that made it (a job definition, a league, a log group), or to all queues (a
+(a job; a run, to the queue of the job that created it; a model, to that of its run), to the key that made it (a job definition, a log group, a thing of a plug-in), or to all queues (a
 queue itself, a compute environment, a scheduling policy).
 
 ================================  ===========================  ============================================================
@@ -14,7 +14,7 @@ run of no known queue             reads, writes                nothing
 job definition of its own         reads, writes, submits       reads, writes, submits
 another's, tagged for its queue   reads, writes, submits       reads, submits
 another's                         reads, writes, submits       reads, without the values of environment variables
-league                            reads, writes                reads, creates its own; disqualifies in its own
+thing of a plug-in                reads, writes                reads, creates its own; changes its own
 log group                         reads, writes                reads, creates its own; changes its own
 what all queues share             reads, writes                reads
 ================================  ===========================  ============================================================
@@ -124,20 +124,9 @@ class Operation(StrEnum):
     TAKE_GARBAGE = "POST /api/gc"
     LIST_MODELS = "GET /api/models"
     READ_MODEL = "GET /api/models/{name}"
-    LIST_LEAGUES = "GET /api/leagues"
-    CREATE_LEAGUE = "POST /api/leagues"
-    READ_LEAGUE = "GET /api/leagues/{name}"
-    READ_LEAGUE_TABLE = "GET /api/leagues/{name}/entries"
-    READ_ENTRY = "GET /api/leagues/{name}/entries/{number}"
-    RACE = "POST /api/leagues/{name}/races"
-    RERUN_ENTRY = "POST /api/leagues/{name}/entries/{number}/races"
-    ENTER_LEAGUE = "POST /api/leagues/{name}/entries"
-    DISQUALIFY = "POST /api/leagues/{name}/entries/{number}/disqualify"
     READ_KEYS = "GET /api/keys"
     CREATE_KEY = "POST /api/keys"
     DELETE_KEY = "DELETE /api/keys/{name}"
-    LIST_TRACKS = "GET /api/tracks"
-    MAKE_TRACK = "POST /api/tracks"
     KEEP_TEXT = "PUT /api/texts/{sha256}"
     READ_TEXT = "GET /api/runs/{name}/texts/{sha256}"
     READ_WEBHOOKS = "GET /api/webhooks"
@@ -147,6 +136,15 @@ class Operation(StrEnum):
     def reads(self) -> bool:
         """Whether it changes nothing, so that a read-only key may send it."""
         return self.value.startswith(("GET ", "Describe", "List", "Get", "Filter", "StartLiveTail"))
+
+
+class AddedOperation(str):
+    """An operation of a plug-in: method and path of its route."""
+
+    @property
+    def reads(self) -> bool:
+        """As :attr:`Operation.reads`."""
+        return self.startswith("GET ")
 
 
 _OF_THE_OWNER = frozenset({Operation.ARCHIVE_RUN, Operation.DELETE_RUN})
@@ -162,9 +160,11 @@ class JobsOf:
 
 
 @dataclass(frozen=True)
-class LeagueOf:
-    """A league, and the key that created it."""
+class Owned:
+    """Something of a plug-in: its owner and keys with all queues change it, all read it."""
 
+    kind: str
+    """In words, such as ``league``."""
     name: str
     owner: str
 
@@ -174,7 +174,7 @@ class Shared:
     """Something of all queues that has no row yet."""
 
 
-_OfQueues = Job | RunRecord | JobsOf | JobDefinition | LeagueOf | LogGroup
+_OfQueues = Job | RunRecord | JobsOf | JobDefinition | Owned | LogGroup
 Object = _OfQueues | JobQueue | ComputeEnvironment | SchedulingPolicy | Shared
 
 
@@ -192,7 +192,7 @@ class Actor:
     queues: frozenset[str] | None = None
     read_only: bool = False
 
-    def check(self, operation: Operation, *objects: Object) -> None:
+    def check(self, operation: Operation | AddedOperation, *objects: Object) -> None:
         """Raise Refusal (403, AccessDeniedException) where the actor may not do this to all of these objects."""
         if self.read_only and not operation.reads:
             raise Refusal(
@@ -206,7 +206,7 @@ class Actor:
                     )
                 raise self._refusal(operation, _whose(each))
 
-    def check_all_queues(self, operation: Operation) -> None:
+    def check_all_queues(self, operation: Operation | AddedOperation) -> None:
         """Raise Refusal unless the actor may see all queues in one answer."""
         if self.queues is not None:
             raise self._refusal(operation, "it tells of all queues")
@@ -219,7 +219,7 @@ class Actor:
         """An answer as the actor may see it: to a read-only key without the values of environment variables."""
         return without_values(answer) if self.read_only else answer
 
-    def _refusal(self, operation: Operation, why: str) -> Refusal:
+    def _refusal(self, operation: Operation | AddedOperation, why: str) -> Refusal:
         queues = ", ".join(sorted(self.queues or ())) or "none"
         return Refusal(
             "AccessDeniedException", f"{self.name} may use job queue {queues} only: {operation} is refused, since {why}"
@@ -248,7 +248,7 @@ def _hidden(environment: Any) -> Any:
     return environment
 
 
-def _allowed(actor: Actor, operation: Operation, thing: Object) -> bool:
+def _allowed(actor: Actor, operation: Operation | AddedOperation, thing: Object) -> bool:
     queues = actor.queues
     if queues is None:
         return True
@@ -257,7 +257,7 @@ def _allowed(actor: Actor, operation: Operation, thing: Object) -> bool:
             return thing.queue in queues and thing.owner == actor.name
         case Job() | RunRecord() | JobsOf():
             return thing.queue in queues
-        case LeagueOf() | LogGroup():
+        case Owned() | LogGroup():
             return thing.owner == actor.name or operation.reads
         case JobDefinition():
             shared = thing.tags.get(QUEUES_TAG, "").split()
@@ -280,8 +280,8 @@ def _whose(thing: Object) -> str:
             return f"run {thing.name} belongs to {f'job queue {thing.queue}' if thing.queue else 'no known job queue'}"
         case JobsOf():
             return f"it concerns job queue {thing.queue}"
-        case LeagueOf():
-            return f"league {thing.name} was created by {thing.owner}"
+        case Owned():
+            return f"{thing.kind} {thing.name} was created by {thing.owner}"
         case LogGroup():
             return f"log group {thing.name[:200]} was created by {thing.owner or 'the controller'}"
         case JobDefinition():

@@ -18,7 +18,8 @@ from orchestrator.persistence.ownership import owner_of
 from orchestrator.services.context import Context, archived, permitted_run, release
 from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.permissions import Operation
-from racer.control.racing_tracks import check_tracks
+from orchestrator.services.stored_names import check_training
+from shared_store.contract import plugins
 from shared_store.contract.error_text import shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.contents import is_archived
@@ -72,7 +73,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
         The teacher's weights, where the job's run has to hold a copy of them.
     """
     store, spec = context.controller.access.store, gang.spec
-    check_tracks(store, spec, context.read)
+    check_training(store, spec, context.read)
     teacher = None
     mains = set(_sources(gang.nodes[gang.main]))
     for source in sources_of(gang):
@@ -93,7 +94,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
             owner = owner_of(context.session, context.found(source.run))
             if owner is None or not context.actor.may_see(owner):  # another's is as one that does not exist yet
                 context.actor.check(Operation.SUBMIT_JOB, RunRecord(name=source.run, queue=""))
-        if source.key in ("evaluate", "race") and not is_waiting:
+        if source.key in plugins.evaluating() and not is_waiting:
             evaluated = partial(check_evaluation, store, context.run(source.run), spec or {}, source.key)
             context.read((source.key, source.run), evaluated)
         if is_teacher and not is_waiting:
@@ -197,7 +198,7 @@ def _sources(node: NodeSpec) -> Iterator[Source]:
         sections = node.spec or {}
     except (ValueError, RecursionError):
         return  # refused where it is read
-    for kind in ("evaluate", "race", "export", "record", "render"):
+    for kind in (*plugins.evaluating(), "export", "record", "render"):
         section = sections.get(kind)
         if isinstance(section, dict) and isinstance(section.get("run"), str):
             yield Source(section["run"], kind)

@@ -23,10 +23,10 @@ from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import Actor, JobsOf, Operation
 from orchestrator.services.sources import with_teacher
+from orchestrator.services.stored_names import check_training
 from orchestrator.services.submission import Submission
 from orchestrator.spec.compile import compile_definition, compile_submission, long_texts, with_environment
 from orchestrator.spec.model import Spec
-from racer.control.racing_tracks import check_tracks
 from shared_store.volume.initial_weights import TeacherCopy
 
 
@@ -81,7 +81,7 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     definition = compile_definition(spec, directory)
     context.actor.check(Operation.SUBMIT_JOB, JobsOf(named_queue(context.session, context.actor, spec.queue).name))
-    check_tracks(context.controller.access.store, spec.document(), context.read)
+    check_training(context.controller.access.store, spec.document(), context.read)
     if len(json.dumps(definition).encode()) > LARGEST_DEFINITION:
         raise ClientError(
             f"the job's definition has more than {LARGEST_DEFINITION} bytes; shorten its environment and its command",
@@ -138,7 +138,7 @@ def submit(
     queue = submission.open_queue(context, named_queue(context.session, context.actor, spec.queue), spec.share)
     properties = with_environment(document["nodeProperties"], environment or {})
     gang = gang_needs(properties)
-    definition = definitions.register(context, spec.name, document, gang, again=False)
+    definition = definitions.revision(context, spec.name, document, gang, again=False)
     context.actor.check(Operation.SUBMIT_JOB, definition)
     _check_fit(context, spec, queue, gang, what)
     retry, timeout = document["retryStrategy"], document.get("timeout") or {}
@@ -159,6 +159,7 @@ def submit(
             tags=tags,
         ),
     )
+    context.session.add(definition)  # not before: others share the commit, and what is refused must leave nothing in it
     context.session.flush()
     return job
 

@@ -7,9 +7,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from orchestrator.spec.model import Spec
+from shared_store.contract import plugins
 from shared_store.volume.texts import beside
 
-_MODULES = {kind: f"worker.{kind}" for kind in ("train", "evaluate", "race", "export", "record", "render")}
+_MODULES = {
+    **{kind: f"worker.{kind}" for kind in ("train", "evaluate", "export", "record", "render")},
+    **{key: section.rank for key, section in plugins.sections().items()},
+}
+"""The module that each rank of a kind of jobs runs."""
 
 
 def compile_definition(spec: Spec, directory: str) -> dict[str, Any]:

@@ -21,14 +21,14 @@ AUTOMATIC_TAG = "muster:automatic-evaluation"
 def evaluation_document(
     run: str, trained: Mapping[str, Any], section: Mapping[str, Any], name: str | None = None, kind: str = "evaluate"
 ) -> dict[str, Any]:
-    """The spec of a job that evaluates ``run``, or races it, on one node like those of its training.
+    """The spec of a job that evaluates ``run`` on one node like those of its training.
 
     Args:
         run: Name of the run.
         trained: Spec of the training.
-        section: What ``evaluate`` or ``race`` says beside the run.
-        name: Of the job; ``evaluate-RUN`` or ``race-RUN`` where None.
-        kind: ``evaluate`` or ``race``.
+        section: What its section says beside the run.
+        name: Of the job; ``KIND-RUN`` where None.
+        kind: Key of the section, one of :func:`shared_store.contract.plugins.evaluating`.
     """
     resources = dict(trained.get("resources") or {})
     if resources.get("gpus"):

@@ -20,11 +20,11 @@ from orchestrator.domain.errors import SpecError
 from orchestrator.spec.changes import override
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import place_of
+from shared_store.contract import plugins
 from shared_store.contract.file_fields import KeptFile, kept_files
 from shared_store.volume.run_settings import setting_at
 from shared_store.volume.texts import IN_DEFINITION, LARGEST, beside, is_reference, size_in_definition
 
-_SECTIONS = ("train", "evaluate", "race")
 Note = Callable[[str], object]
 """Is called with a line for the user."""
 TextOf = Callable[[str], str | None]
@@ -66,7 +66,7 @@ def with_files(
     for section, field, value, how in _fields(document, task):
         if isinstance(value, str):
             try:
-                content = _content(value, how, _Checked(how, _whole(document[section], base), store, note))
+                content = _content(value, how, _Checked(how, _whole(section, document[section], base), store, note))
             except SpecError as error:
                 raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
             values = result[section]
@@ -109,7 +109,7 @@ def check_texts(
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
     for section, field, value, how in _fields(document):
         try:
-            _check_text(value, field, _Checked(how, _whole(document[section], None), store, note))
+            _check_text(value, field, _Checked(how, _whole(section, document[section], None), store, note))
         except SpecError as error:
             raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
 
@@ -125,14 +125,14 @@ def _check_again(
     text_of: TextOf,
 ) -> None:
     """Check the texts of ``base`` where a section changes what their check depends on. Raises SpecError."""
-    for section in _SECTIONS:
+    for section in ("train", *plugins.evaluating()):
         values = document.get(section)
         if not isinstance(values, Mapping):
             continue
         config, name = values.get("config") or {}, values.get("task", task)
         if not isinstance(config, Mapping):
             continue
-        whole = _whole(values, base)
+        whole = _whole(section, values, base)
         for field, how in kept_files(task_config(name) if isinstance(name, str) else None).items():
             changed = [key for key in how.given if whole.get(key) != base.get(key)]
             if field in config or not changed:
@@ -155,10 +155,11 @@ def _with_text(value: Any, field: str, text_of: TextOf, note: Note | None) -> An
     return value
 
 
-def _whole(values: Mapping[str, Any], base: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """The configuration of a section, as far as it is known; a race names its track beside it."""
-    track = {"track": values["track"]} if values.get("track") else {}
-    return {**(base or {}), **(values.get("config") or {}), **track}
+def _whole(section: str, values: Mapping[str, Any], base: Mapping[str, Any] | None) -> Mapping[str, Any]:
+    """The configuration of a section, as far as it is known."""
+    added = plugins.sections().get(section)
+    changes = plugins.load(added.rules).changes(values) if added else values.get("config") or {}
+    return {**(base or {}), **changes}
 
 
 def _check_text(value: Any, field: str, checked: _Checked) -> None:
@@ -173,7 +174,7 @@ def _check_text(value: Any, field: str, checked: _Checked) -> None:
 
 def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tuple[str, str, Any, KeptFile]]:
     """Section, name and value of the given fields that may name a file; of a task that is installed."""
-    for section in _SECTIONS:
+    for section in ("train", *plugins.evaluating()):
         values = document.get(section)
         config = values.get("config") if isinstance(values, Mapping) else None
         if not isinstance(values, Mapping) or not isinstance(config, Mapping):

@@ -7,26 +7,35 @@ job model. It is carried whole in the definition's environment, so that a run ca
 from __future__ import annotations
 
 import math
-import operator
 import re
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     AfterValidator,
     BaseModel,
-    BeforeValidator,
     Field,
     PrivateAttr,
     SerializerFunctionWrapHandler,
     ValidationError,
+    create_model,
     model_serializer,
     model_validator,
 )
 
 from orchestrator.domain.errors import SpecError
-from orchestrator.spec.sections import CheckpointPolicy, Evaluation, Logs, NodeRange, Resources, Retry, Share
+from orchestrator.spec.sections import (
+    ACCEPT,
+    CheckpointPolicy,
+    Evaluation,
+    Logs,
+    NodeRange,
+    OfCheckpoint,
+    Resources,
+    Retry,
+    Share,
+)
 from orchestrator.spec.settings import effective_problem, section_of, settings_classes, task_config, train_section
 from orchestrator.spec.track import Track, key_in
 from orchestrator.spec.values import (
@@ -34,17 +43,16 @@ from orchestrator.spec.values import (
     Duration,
     Environment,
     JobName,
-    RunName,
     Secrets,
     Section,
     TaskName,
     place_of,
 )
-from racer.store.races import DEFAULTS, TRIALS
+from shared_store.contract import plugins
 from shared_store.contract.error_text import Refused, explain, kind_of, nearest, path_of, shown
 from shared_store.volume.texts import beside
 
-KINDS = ("train", "evaluate", "race", "export", "record", "render", "command")
+KINDS = ("train", *plugins.evaluating(), "export", "record", "render", "command")
 """The kinds of jobs: a spec has exactly one of these keys."""
 
 
@@ -58,13 +66,6 @@ def _algorithm_name(value: str) -> str:
         return value
     hint = nearest(value, known, f"there are {', '.join(known)}, and module:Class of your own")
     raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
-
-
-ACCEPT = Field(
-    default=False,
-    exclude_if=operator.not_,
-    description="whether to continue although the robot's file loads differently from the checkpoint's training",
-)
 
 
 class _Train(Section):
@@ -83,7 +84,7 @@ class _Train(Section):
     hyperparameters: dict[str, Any] | str | None = Field(
         default=None,
         exclude=True,
-        description="settings under the names of DeepRacer, of a racer's task, or a JSON file of them; they become settings of ppo or sac",
+        description="settings under other names that the task knows, or a JSON file of them; they become settings of ppo or sac",
     )
 
     @property
@@ -111,25 +112,7 @@ else:
     Train = train_section(_Train, {name: section_of(name, each, Section) for name, each in ALGORITHMS.items()})
 
 
-CheckpointName = int | Literal["best", "latest"]
-"""An iteration, or what ``RUN@best`` and ``RUN@latest`` mean."""
-
-
-def _checkpoint(value: object) -> object:
-    if value in (None, "best", "latest") or (isinstance(value, int) and not isinstance(value, bool) and value >= 0):
-        return value
-    raise ValueError("expected an iteration, best or latest")
-
-
-class _OfCheckpoint(Section):
-    run: RunName
-    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
-        default=None, description="iteration, best or latest; the latest where absent"
-    )
-    accept_changed_robot: bool = ACCEPT
-
-
-class Evaluate(_OfCheckpoint):
+class Evaluate(OfCheckpoint):
     """Evaluate a checkpoint of a run with the mean action."""
 
     episodes: int = Field(default=100, ge=1, le=1_000_000, description="of all ranks together")
@@ -143,38 +126,14 @@ class Evaluate(_OfCheckpoint):
     keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
 
 
-class Race(_OfCheckpoint):
-    """Have a checkpoint of a racer's run drive laps from the start line, in a world each."""
-
-    trials: int = Field(default=TRIALS, ge=1, le=100, description="laps")
-    continuous: bool = Field(
-        default=DEFAULTS["continuous"], description="whether a car is put back; else a lap ends with its first mishap"
-    )
-    off_track_penalty: float = Field(default=DEFAULTS["off_track_penalty"], ge=0, description="of each time [s]")
-    crash_penalty: float = Field(default=DEFAULTS["crash_penalty"], ge=0, description="of each obstacle [s]")
-    max_resets: int = Field(default=DEFAULTS["max_resets"], ge=0, le=1_000_000, description="in a lap")
-    seconds: float = Field(default=DEFAULTS["seconds"], gt=0, le=3600, description="simulated, of a lap")
-    track: Annotated[str, Field(min_length=1, max_length=100)] | list[str] | None = Field(
-        default=None,
-        description="name, or names that are dealt to the laps in turn; those of the training where absent",
-    )
-    seed: int | None = Field(
-        default=None, ge=0, lt=2**63, description="of the worlds; by default one that follows from the training's"
-    )
-    config: dict[str, Any] = Field(
-        default_factory=dict, description="further changes of the configuration with which the run was trained"
-    )
-    keep: bool = Field(default=True, description="whether the checkpoint is kept from now on")
-
-
-class Export(_OfCheckpoint):
+class Export(OfCheckpoint):
     """Export the policy of a checkpoint as a bundle: ONNX, TorchScript, contract, and how they were compared with it."""
 
     episodes: int = Field(default=16, ge=0, description="on which bundle and policy are compared, at least; 0: none")
     worlds: int = Field(default=16, ge=1, description="simulated worlds of the comparison")
 
 
-class Record(_OfCheckpoint):
+class Record(OfCheckpoint):
     """Record a checkpoint's policy on a few worlds as an MCAP file."""
 
     worlds: int = Field(default=4, ge=1, le=16, description="worlds that are recorded")
@@ -184,7 +143,7 @@ class Record(_OfCheckpoint):
     )
 
 
-class Render(_OfCheckpoint):
+class Render(OfCheckpoint):
     """Film a checkpoint's policy."""
 
     format: Literal["mp4", "gif", "png"] = Field(default="gif", description="png: six moments side by side")
@@ -203,7 +162,7 @@ class Render(_OfCheckpoint):
         return self
 
 
-class Spec(Section):
+class _Spec(Section):
     """One job."""
 
     name: JobName
@@ -217,7 +176,6 @@ class Spec(Section):
     resources: Resources = Field(default_factory=Resources)
     train: Train | None = None
     evaluate: Evaluate | None = None
-    race: Race | None = None
     export: Export | None = None
     record: Record | None = None
     render: Render | None = None
@@ -252,24 +210,24 @@ class Spec(Section):
         return document
 
     @model_validator(mode="after")
-    def _one_kind(self) -> Spec:
+    def _one_kind(self) -> _Spec:
         given = [kind for kind in KINDS if getattr(self, kind) is not None]
         if not given:
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found none")
         if self.evaluation is not None and self.train is None:
             raise ValueError(f"evaluation is for jobs that train, not for {given[0]}")
-        if self.race is not None and (self.nodes.max > 1 or self.resources.gpus > 1):
-            raise ValueError("race: it runs on one node with at most one GPU")
+        if given[0] in plugins.sections() and (self.nodes.max > 1 or self.resources.gpus > 1):
+            raise ValueError(f"{given[0]}: it runs on one node with at most one GPU")
         return self
 
     @model_validator(mode="after")
-    def _given_once(self) -> Spec:
+    def _given_once(self) -> _Spec:
         if both := sorted(self.secrets.keys() & self.environment.keys()):
             raise ValueError(f"secrets: {both[0]} is in environment, too; give it once")
         return self
 
     @model_validator(mode="after")
-    def _trackable(self) -> Spec:
+    def _trackable(self) -> _Spec:
         if self.track is None:
             return self
         if self.train is None:
@@ -295,7 +253,7 @@ class Spec(Section):
         """It as JSON."""
         return self.model_dump(mode="json", exclude_none=True)
 
-    def with_notes(self, notes: Iterable[str]) -> Spec:
+    def with_notes(self, notes: Iterable[str]) -> Self:
         """This spec, with further notes."""
         self._notes += tuple(notes)
         return self
@@ -308,6 +266,13 @@ class Spec(Section):
     @property
     def ranks_per_node(self) -> int:
         return max(1, self.resources.gpus)
+
+
+if TYPE_CHECKING:
+    Spec = _Spec
+else:
+    _added = {key: (plugins.load(section.model) | None, None) for key, section in plugins.sections().items()}
+    Spec = create_model("Spec", __base__=_Spec, __doc__=_Spec.__doc__, **_added)
 
 
 def validate(

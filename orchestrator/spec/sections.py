@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import operator
 from typing import Annotated, Literal
 
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from orchestrator.domain.gang import MOST_NODES
-from orchestrator.spec.values import Memory, Section, Size
+from orchestrator.spec.values import Memory, RunName, Section, Size
 from shared_store.contract.node import LEAST_LOG_LIMIT, LOG_LIMIT
 
+ACCEPT = Field(
+    default=False,
+    exclude_if=operator.not_,
+    description="whether to continue although the robot's file loads differently from the checkpoint's training",
+)
+CheckpointName = int | Literal["best", "latest"]
+"""An iteration, or what ``RUN@best`` and ``RUN@latest`` mean."""
 Share = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")]
 
 
@@ -79,3 +87,19 @@ class Evaluation(Section):
         default=None, description="of the one node; where absent those of a node of the training, with at most one GPU"
     )
     retry: Retry = Field(default_factory=Retry)
+
+
+def _checkpoint(value: object) -> object:
+    if value in (None, "best", "latest") or (isinstance(value, int) and not isinstance(value, bool) and value >= 0):
+        return value
+    raise ValueError("expected an iteration, best or latest")
+
+
+class OfCheckpoint(Section):
+    """What every job says that reads a checkpoint of a run."""
+
+    run: RunName
+    checkpoint: Annotated[CheckpointName | None, BeforeValidator(_checkpoint)] = Field(
+        default=None, description="iteration, best or latest; the latest where absent"
+    )
+    accept_changed_robot: bool = ACCEPT

@@ -248,12 +248,12 @@ def submit(
     path = f"/api/leagues/{named(league)}"
     if detach:
         with Client.connect() as client:
-            _tell_started(client.post(f"{path}/races", body, seconds=300), league, racer, as_json)
+            _tell_started(client.post(f"{path}/races", body, seconds=300, once=True), league, racer, as_json)
         return
     with controller(store, cpus) as connect:
         client = connect()
         if evaluation is None:
-            started = client.post(f"{path}/races", body, seconds=300)
+            started = client.post(f"{path}/races", body, seconds=300, once=True)
             code = see_through(client, started["jobId"], *([_quietly] if as_json else []))
             if code:
                 raise typer.Exit(code)
@@ -376,7 +376,7 @@ def verify(
 def _again(client: Client, path: str, entry: Mapping[str, Any]) -> list[str]:
     """Differences between an entry and a repetition of its race, one line each."""
     try:
-        started = client.post(path, {"directory": os.getcwd()}, seconds=300)
+        started = client.post(path, {"directory": os.getcwd()}, seconds=300, once=True)
     except NotServing:
         raise
     except ApiError as error:  # of this entry only: for example, its checkpoint was deleted

@@ -17,12 +17,12 @@ from orchestrator.console.forms import Form, Question, body_of, done, sent_form
 from orchestrator.console.live import Recent, Rows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.console.submit_fields import races as races_of
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from racer.control import league_routes as api
 from racer.control.league_routes import LEAGUE_TAG, MODEL_TAG
-from racer.control.track_pages import track_names
+from racer.control.submit_form import FORM
+from racer.control.track_pages import OUTLINE, track_names
 from racer.store.leagues import moment
 from racer.store.races import clock
 from racer.store.standings import RANKINGS
@@ -46,7 +46,9 @@ def leagues(request: Request) -> Response:
     found = [
         {"name": each["name"], "problem": each.get("problem", ""), **_shown(each)} for each in api.list_leagues(request)
     ]
-    return render(request, "leagues.html", leagues=found, tracks=tracks, no_tracks=missing, rankings=RANKINGS)
+    return render(
+        request, "leagues.html", leagues=found, tracks=tracks, no_tracks=missing, rankings=RANKINGS, outline=OUTLINE
+    )
 
 
 @router.post("/leagues")
@@ -71,7 +73,9 @@ def league(request: Request, name: str, every: bool = Query(default=False)) -> R
         {**row, "time": clock(row["time"]), "best_lap": clock(row["best_lap"])}
         for row in api.league_table(request, name, every)
     ]
-    models = [f"{each['name']}@{each['version']}" for each in list_models(request) if races_of(str(each.get("task")))]
+    models = [
+        f"{each['name']}@{each['version']}" for each in list_models(request) if FORM.includes(str(each.get("task")))
+    ]
     return render(
         request,
         "league.html",

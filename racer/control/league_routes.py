@@ -24,11 +24,13 @@ from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, using, with_store
-from orchestrator.services.models import entered_model, find_model, owner_of_model
-from orchestrator.services.permissions import CONTROLLER, Actor, LeagueOf, Operation
+from orchestrator.services.models import any_model, find_model, owner_of_model
+from orchestrator.services.permissions import CONTROLLER, Actor, Owned
 from orchestrator.services.spec_submission import submit
 from orchestrator.spec.settings import task_config
+from racer.control import operations
 from racer.control.league_races import race_job
+from racer.settings.task import RacerConfig
 from racer.store import leagues
 from racer.store.leagues import League, LeagueError, Rules, StoredLeague, UnknownLeague
 from racer.store.standings import BadRace, Ranking, read_race, table
@@ -114,7 +116,7 @@ def list_leagues(request: Request) -> list[dict[str, Any]]:
 def create_league(request: Request, body: CreateRequest) -> dict[str, Any]:
     """Create a league; its rules are never changed."""
     controller, actor = controller_of(request), actor_of(request)
-    actor.check(Operation.CREATE_LEAGUE)
+    actor.check(operations.CREATE_LEAGUE)
     controller.writes.check(adds=True)
     if body.opens is not None and body.closes is not None and body.opens >= body.closes:
         raise ClientError("opens: the league would close before it opens")
@@ -171,7 +173,7 @@ def read_entry(request: Request, name: str, number: int) -> Any:
     found: dict[str, Any] = {"entry": number}
     try:
         found = stored.entry(number)
-        model = entered_model(controller, found)
+        model = any_model(controller, found["model"]["name"], found["model"]["version"])
         _verify(model)
         _check_digest(model, found)
     except UnknownLeague as error:
@@ -194,7 +196,7 @@ def race(
     controller, actor = controller_of(request), actor_of(request)
     stored, league = _find(controller, name)
     model = find_model(controller, actor, body.model, body.version)
-    actor.check(Operation.RACE, owner_of_model(model))
+    actor.check(operations.RACE, owner_of_model(model))
     try:
         if closed := league.closed(time.time()):
             raise LeagueError(closed)
@@ -219,8 +221,8 @@ def rerun(
         entry = stored.entry(number)
     except LeagueError as error:
         raise _refused(error) from None
-    model = entered_model(controller, entry)
-    actor.check(Operation.RERUN_ENTRY, owner_of_model(model))
+    model = any_model(controller, entry["model"]["name"], entry["model"]["version"])
+    actor.check(operations.RERUN_ENTRY, owner_of_model(model))
     _check_digest(model, entry)
     return _submit(controller, actor, league, model, body.directory, idempotency_key)
 
@@ -231,7 +233,7 @@ def enter(request: Request, name: str, body: EnterRequest) -> dict[str, Any]:
     controller, actor = controller_of(request), actor_of(request)
     stored, league = _find(controller, name)
     model = find_model(controller, actor, body.model, body.version)
-    actor.check(Operation.ENTER_LEAGUE, owner_of_model(model))
+    actor.check(operations.ENTER_LEAGUE, owner_of_model(model))
     controller.writes.check(adds=True)
     checkpoint = _checked(controller, league, model)
     job, run = _race_of(controller, actor, league, body.job)
@@ -259,7 +261,7 @@ def disqualify(request: Request, name: str, number: int, body: DisqualifyRequest
     """Disqualify an entry for good, with the reason; the entry itself stays as it is. For the league's owner."""
     controller, actor = controller_of(request), actor_of(request)
     stored, league = _find(controller, name)
-    actor.check(Operation.DISQUALIFY, LeagueOf(league.name, league.owner))
+    actor.check(operations.DISQUALIFY, Owned("league", league.name, league.owner))
     controller.writes.check(adds=True)
     try:
         stored.disqualify(number, body.reason, _caller(actor))
@@ -357,7 +359,7 @@ def _checked(controller: Controller, league: League, model: Model) -> Checkpoint
     except LeagueError as error:
         raise _refused(error) from None
     kind = task_config(str(facts.get("task")))
-    if kind is None or not kind.races:  # what a class of the user's own drives is unknown
+    if kind is None or not issubclass(kind, RacerConfig):  # what a class of the user's own drives is unknown
         raise ClientError(
             f"model {model.reference} is of task {facts.get('task')}; a league takes models of the racer's installed tasks"
         )
@@ -389,7 +391,7 @@ def _race_of(controller: Controller, actor: Actor, league: League, reference: st
         job = find_job(session, reference, queues)
         if job is None:
             raise ClientError(unknown_job(session, reference, queues), 404)
-        actor.check(Operation.ENTER_LEAGUE, job)
+        actor.check(operations.ENTER_LEAGUE, job)
         if job.status != Status.SUCCEEDED:
             raise ClientError(
                 f"job {named(job.name, job.id)} is {job.status}: only a race that has SUCCEEDED is entered", CONFLICT

@@ -15,13 +15,15 @@ from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
-from orchestrator.services.permissions import Operation
+from racer.control.operations import LIST_TRACKS
 from racer.control.track_routes import MakeRequest, list_tracks, make_track, picture
 from racer.store import tracks as stored
 from shared_store.contract.error_text import nearest
 
 router = page_router(stored=True)
 
+OUTLINE = "/tracks/{}/outline.svg"
+"""Address of a track's drawing, in which ``{}`` is its name."""
 _SIZE = (240.0, 160.0)
 """Width and height of an outline."""
 _GREY, _RED = "#808791", "#d55e00"
@@ -73,7 +75,7 @@ def outline(request: Request, name: str) -> Response:
 def large(request: Request, name: str) -> Response:
     """The picture that ``muster tracks show`` draws."""
     controller, actor = controller_of(request), actor_of(request)
-    actor.check(Operation.LIST_TRACKS)
+    actor.check(LIST_TRACKS)
     key = ("picture", str(controller.access.store.path), name)
     return _picture(_recent.get(key, partial(picture, controller, name)), "image/png")
 
@@ -81,7 +83,7 @@ def large(request: Request, name: str) -> Response:
 def known(request: Request) -> Sequence[Mapping[str, Any]]:
     """All tracks with their measures and borders. Raises ClientError."""
     actor = actor_of(request)
-    actor.check(Operation.LIST_TRACKS)
+    actor.check(LIST_TRACKS)
     store = controller_of(request).access.store
     try:
         names = tuple(stored.names(store))

@@ -15,7 +15,8 @@ from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.api.turns import Turns
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError, ServerError, UsageError
-from orchestrator.services.permissions import Operation, Shared
+from orchestrator.services.permissions import Shared
+from racer.control.operations import LIST_TRACKS, MAKE_TRACK
 from racer.control.track_orders import ask
 
 router = APIRouter(route_class=StoreRoute)
@@ -47,7 +48,7 @@ def list_tracks(
 ) -> list[dict[str, Any]]:
     """The presets and the tracks of the store with their measures [m]; one that is damaged has a ``problem`` instead."""
     controller, actor = controller_of(request), actor_of(request)
-    actor.check(Operation.LIST_TRACKS)
+    actor.check(LIST_TRACKS)
     if name is None:
         found: list[dict[str, Any]] = _ask(controller, {"action": "list", "rings": rings})
         return found
@@ -58,7 +59,7 @@ def list_tracks(
 def make_track(request: Request, body: MakeRequest) -> dict[str, Any]:
     """Make a track from a preset or a seed, and keep it in the store, for good."""
     controller, actor = controller_of(request), actor_of(request)
-    actor.check(Operation.MAKE_TRACK, Shared())
+    actor.check(MAKE_TRACK, Shared())
     controller.writes.check(adds=True)
     if (body.preset is None) == (body.seed is None):
         raise ClientError("give one of preset and seed")

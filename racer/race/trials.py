@@ -14,7 +14,7 @@ import warp as wp
 
 from racer.car.sim_trace import CONTINUOUS, SIM_TRACE_COLUMNS, model_documents, sim_trace, write_documents
 from racer.car.trace import COLUMNS
-from racer.store.races import SIM_TRACE
+from racer.store.races import SIM_TRACE, rules_of
 from shared_store.volume.files import write_atomic
 from worker.simulation.capture import on_torch_stream
 
@@ -121,7 +121,7 @@ class Race:
         trials = self.summary()["trials"]
         return {name: [trial[name] for trial in trials] for name in trials[0] if name != "seed"}
 
-    def write_sim_traces(self, evaluation: Path) -> None:
+    def write(self, evaluation: Path) -> None:
         """Write a SimTrace file for each trial below the directory of an evaluation, in the layout that log tools look for, and what
         they look for beside them.
 
@@ -160,6 +160,10 @@ class Laps:
         rows = torch.cat([self._trace, task.rewards[:, None], action], 1)
         worlds = running.nonzero()[:, 0]
         self._noted.append((time.time(), worlds.cpu(), rows[worlds].cpu()))
+
+    def result(self, played: Episodes, section: Mapping[str, Any], seed: int, facts: Mapping[str, Any]) -> Race:
+        """As :class:`worker.evaluation.evaluation.Watcher` says."""
+        return self.race(played, rules_of(section), seed, facts)
 
     def race(
         self, played: Episodes, rules: Mapping[str, Any], seed: int, facts: Mapping[str, Any] | None = None

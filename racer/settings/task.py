@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
@@ -15,8 +15,10 @@ from racer.rewards.parameters import MOST_OBJECTS
 from racer.rewards.reward_file import RewardFile
 from racer.settings.actions import LIDARS, ActionSpace, action_space, read_metadata
 from racer.settings.hyperparameters import KNOWN, plain_settings
+from racer.store.leagues import problem_of_track
 from racer.tracks.obstacles import ObstacleConfig
 from shared_store.contract.file_fields import kept_file
+from shared_store.volume.layout import Store
 from worker.settings.overrides import Refused, expecting, from_mapping
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import (
@@ -99,7 +101,6 @@ class RacerConfig(TaskConfig):
             a value.
     """
 
-    races: ClassVar[bool] = True
     may_change: ClassVar[tuple[str, ...]] = ("sim_trace",)
     hyperparameters: ClassVar[tuple[str, ...]] = tuple(KNOWN)
     other_rewards: ClassVar[Mapping[str, float]] = {"reward": 1.0}
@@ -234,6 +235,18 @@ class RacerConfig(TaskConfig):
             where = ("lidar",) if self.lidar else ("action_space", "sensor")
             raise Refused(where, "the policy of this task sees an image alone; use task RacerPixelsAndState")
         return self.lidar or LidarConfig(**LIDARS[str(space.lidar)])
+
+    @classmethod
+    def stored_names(cls, overrides: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """As :meth:`TaskConfig.stored_names`: the tracks."""
+        named = overrides.get("track")
+        names = [named] if isinstance(named, str) else named if isinstance(named, list | tuple) else []
+        return (("track", name) for name in names if isinstance(name, str))
+
+    @classmethod
+    def missing(cls, store: Store, key: str, name: str) -> str | None:
+        """As :meth:`TaskConfig.missing`."""
+        return problem_of_track(store, name)
 
     @classmethod
     def plain_settings(cls, train: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:

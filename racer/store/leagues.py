@@ -308,10 +308,15 @@ class StoredLeague:
         return document, str(manifest["digest"])
 
 
+def folder_in(store: Store) -> Path:
+    """Where the leagues of a store are."""
+    return store.path / "leagues"
+
+
 def names(store: Store) -> list[str]:
     """Names of all leagues. Raises LeagueError for a link where the directory should be."""
     try:
-        return names_in(store.leagues)
+        return names_in(folder_in(store))
     except (DamagedFile, OSError) as error:
         raise LeagueError(str(error)) from None
 
@@ -322,7 +327,7 @@ def find(store: Store, name: str) -> StoredLeague:
     if name not in known:
         hint = nearest(name, known, "" if known else "none was created yet")
         raise UnknownLeague(f"league {name[:130]} does not exist; {hint}")
-    return StoredLeague(store, store.leagues / name)
+    return StoredLeague(store, folder_in(store) / name)
 
 
 def create(store: Store, league: League) -> StoredLeague:
@@ -335,9 +340,9 @@ def create(store: Store, league: League) -> StoredLeague:
     taken = LeagueError(f"league {league.name} exists already, and a league is never changed; choose another name")
     if league.name in names(store):
         raise taken
-    store.leagues.mkdir(parents=True, exist_ok=True)
-    path = store.leagues / league.name
-    hidden = store.leagues / f".{uuid.uuid4().hex}.tmp"
+    folder_in(store).mkdir(parents=True, exist_ok=True)
+    path = folder_in(store) / league.name
+    hidden = folder_in(store) / f".{uuid.uuid4().hex}.tmp"
     try:
         for folder in ("definition", "entries", "disqualified"):
             (hidden / folder).mkdir(parents=True)
@@ -364,6 +369,15 @@ def digest_of_track(store: Store, name: str) -> str | None:
         return str(track.facts().get("digest"))
     except tracks.TrackError as error:
         raise LeagueError(str(error)) from None
+
+
+def problem_of_track(store: Store, name: str) -> str | None:
+    """Why a track can't be driven on; None: it can."""
+    try:
+        digest_of_track(store, name)
+    except LeagueError as error:
+        return str(error)
+    return None
 
 
 def _same(value: Any, other: Any) -> bool:

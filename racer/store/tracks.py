@@ -67,10 +67,15 @@ class StoredTrack:
         return TrackError(f"track {self.name} is damaged: {error}; delete {self.path} and make or import it again")
 
 
+def folder_in(store: Store) -> Path:
+    """Where the tracks of a store are."""
+    return store.path / "tracks"
+
+
 def names(store: Store) -> list[str]:
     """Names of all tracks. Raises TrackError for a link where the directory should be."""
     try:
-        return names_in(store.tracks)
+        return names_in(folder_in(store))
     except (DamagedFile, OSError) as error:
         raise TrackError(str(error)) from None
 
@@ -92,7 +97,7 @@ def find(store: Store, name: str, others: Sequence[str] = ()) -> StoredTrack:
         raise TrackError(
             f"track {name[:130]} does not exist; {nearest(name, near, '' if near else 'none is kept yet')}"
         )
-    return StoredTrack(store.tracks / name)
+    return StoredTrack(folder_in(store) / name)
 
 
 def add(store: Store, name: str, data: bytes, facts: Mapping[str, Any]) -> StoredTrack:
@@ -112,11 +117,11 @@ def add(store: Store, name: str, data: bytes, facts: Mapping[str, Any]) -> Store
         raise TrackError(
             f"track name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
         )
-    track = StoredTrack(store.tracks / name)
+    track = StoredTrack(folder_in(store) / name)
     if name in names(store):
         raise _taken(track)
-    store.tracks.mkdir(parents=True, exist_ok=True)
-    hidden = store.tracks / f".{uuid.uuid4().hex}.tmp"
+    folder_in(store).mkdir(parents=True, exist_ok=True)
+    hidden = folder_in(store) / f".{uuid.uuid4().hex}.tmp"
     try:
         hidden.mkdir()
         (hidden / FILE).write_bytes(data)

@@ -35,7 +35,7 @@ def list_tracks(order: Order) -> list[Order]:
     for name in stored.names(store):
         try:
             track = resolve(name, store)
-            found.append({**stored.StoredTrack(store.tracks / name).facts(), **_facts(order, track)})
+            found.append({**stored.StoredTrack(stored.folder_in(store) / name).facts(), **_facts(order, track)})
         except (stored.TrackError, UserError) as error:
             found.append({"name": name, "problem": str(error)})
     return found
@@ -84,7 +84,9 @@ def _kept(order: Order, track: Track, origin: Order) -> Order:
     try:
         kept = keep(store, track, origin)
     except OSError as error:
-        raise UserError(f"track {track.name} can't be kept in {store.tracks}: {error.strerror or error}") from None
+        raise UserError(
+            f"track {track.name} can't be kept in {stored.folder_in(store)}: {error.strerror or error}"
+        ) from None
     _write(order, content)
     return {**kept.facts(), "path": str(kept.path)}
 

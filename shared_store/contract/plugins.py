@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     class EvaluationRules(Protocol):
         """Rules by which a section of a job evaluates a checkpoint: in one episode a world, on one node."""
 
+        count: tuple[str, int]
+        """The section's key for the number of episodes, and the number where it is absent."""
+
         def refusal(self, config: type) -> str | None:
             """Why no run is evaluated so whose task has this configuration, as words that follow the task's name; None: it is."""
-
-        def episodes(self, section: Mapping[str, Any]) -> int:
-            """How many episodes there are."""
 
         def changes(self, section: Mapping[str, Any]) -> dict[str, Any]:
             """The changes of the run's ``train.config``."""
@@ -66,7 +66,7 @@ class JobSection:
 
     Attributes:
         key: Of the section, such as ``race``.
-        plural: The word for several such jobs.
+        verb: What such a job does with the run, such as ``races``.
         model: ``module:Class``: the pydantic model of the section, an :class:`orchestrator.spec.sections.OfCheckpoint`.
         rank: Module that the rank runs; it calls :func:`worker.evaluate.main` with the key.
         rules: ``module:name``: :class:`EvaluationRules`. The module imports no torch.
@@ -74,7 +74,7 @@ class JobSection:
     """
 
     key: str
-    plural: str
+    verb: str
     model: str
     rank: str
     rules: str
@@ -93,13 +93,13 @@ class Plugin:
         templates: Package whose folder ``templates`` holds the pages' Jinja templates.
         forms: ``module:name`` of each :class:`orchestrator.console.submit_fields.TaskForm`.
         commands: Of ``muster``.
-        options: By the name of a command of Muster: ``module:function``, which adds options to it.
+        options: Name of a command of Muster, and ``module:name`` of its :class:`orchestrator.cli.catalogue.FurtherOptions`.
         sections: Kinds of jobs.
         folders: In the store, beside ``runs`` and ``models``.
         run_folders: In a run.
         references: ``module:function``: from a store to the runs and jobs that the plug-in's folders need, see
             :mod:`shared_store.volume.references`.
-        bundle_parts: ``module:function``: from a task to further files of its exported bundle, by their names.
+        bundle_parts: ``module:function``: from a task to further JSON documents of an exported bundle, by the names of their files.
     """
 
     operations: tuple[str, ...] = ()

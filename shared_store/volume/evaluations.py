@@ -11,8 +11,8 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from racer.store import races
 from shared_store.contract.error_text import counted
+from shared_store.contract.plugins import load, sections
 from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.volume.layout import LARGEST_DESCRIPTION, Run
 from shared_store.volume.metrics import finite
@@ -119,10 +119,15 @@ def in_one_line(summary: Mapping[str, Any]) -> str:
     )
 
 
+def kind_of(summary: Mapping[str, Any]) -> str:
+    """The key of the job section that made an evaluation, which its summary has, too: ``evaluate`` where no plug-in has made it."""
+    return next((key for key in sections() if _mapping(summary, key)), "evaluate")
+
+
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """An evaluation as lines of text."""
-    if _mapping(summary, "race"):
-        yield from races.lines(summary)
+    if section := sections().get(kind_of(summary)):
+        yield from load(section.rules).lines(summary)
         return
     task, seed = summary.get("task"), summary.get("seed")
     yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"

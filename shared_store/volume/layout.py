@@ -13,6 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+from shared_store.contract.plugins import plugins
 from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_json
 
 FORMAT = 1
@@ -110,11 +111,11 @@ class Run:
             "telemetry",
             "tracking",
             "texts",
-            "sim-trace",
             "logs",
             "outcomes",
             "parent",
             "teachers",
+            *(name for plugin in plugins().values() for name in plugin.run_folders),
         ):
             refuse_links(self.path / name, 2)
 
@@ -257,16 +258,8 @@ class Store:
         return self.path / "models"
 
     @property
-    def tracks(self) -> Path:
-        return self.path / "tracks"
-
-    @property
     def texts(self) -> Path:
         return self.path / "texts"
-
-    @property
-    def leagues(self) -> Path:
-        return self.path / "leagues"
 
     def runs(
         self, after: str = "", most: int | None = None, among: Callable[[Run], bool] = lambda run: True

@@ -1,7 +1,4 @@
-"""References to runs in the store: from models, entries of leagues, clones, and policies that imitate a teacher.
-
-A new kind of thing that needs runs adds a function to :data:`REFERRERS`.
-"""
+"""References to runs in the store: from models, clones, policies that imitate a teacher, and what plug-ins keep."""
 
 from __future__ import annotations
 
@@ -9,13 +6,13 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from racer.store import leagues
-from racer.store.leagues import LeagueError
+from shared_store.contract.plugins import load, plugins
 from shared_store.volume import models
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile, is_there, read_json
 from shared_store.volume.layout import LARGEST_DESCRIPTION, Store, names_in
 from shared_store.volume.models import Model, ModelError
+from shared_store.volume.plugin_folders import orphans
 
 
 class Needed(NamedTuple):
@@ -40,8 +37,8 @@ def references(store: Store) -> tuple[list[Needed], list[str]]:
     """All that in the store needs a run or a job, and what could not be read."""
     needed: list[Needed] = []
     unreadable: list[str] = []
-    for what, referrer in REFERRERS.items():
-        for each in _read(what, referrer, store):
+    for what, referrer in _referrers():
+        for each in read(what, referrer, store):
             if isinstance(each, Needed):
                 needed.append(each)
             else:
@@ -49,79 +46,66 @@ def references(store: Store) -> tuple[list[Needed], list[str]]:
     return needed, unreadable
 
 
-def _read(what: str, referrer: Callable[..., Found], *arguments: Any) -> Found:
-    """What a referrer finds, with what it can't read."""
+def read(what: str, referrer: Callable[..., Found], *arguments: Any) -> Found:
+    """What a function finds, with what it can't read: ``what`` names that, such as ``model ant``."""
     try:
         yield from referrer(*arguments)
     except DamagedBundle as error:  # which names the model
         yield Unreadable(str(error))
-    except (DamagedFile, LeagueError, ModelError, OSError) as error:
+    except (DamagedFile, ModelError, OSError) as error:
         yield Unreadable(f"{what} can't be read ({error})")
 
 
 def _of_models(store: Store) -> Found:
     """Runs of models, with those from which their weights began."""
     for name in names_in(store.models):
-        yield from _read(f"model {name}", _of_versions, store, name)
+        yield from read(f"model {name}", _of_versions, store, name)
 
 
 def _of_versions(store: Store, name: str) -> Found:
     for model in models.versions(store, name):
-        yield from _read(f"model {model.reference}", _of_model, model)
+        yield from read(f"model {model.reference}", _of_model, model)
 
 
 def _of_model(model: Model) -> Found:
     facts = model.facts()
-    yield from _run(facts.get("run"), f"model {model.reference} is of it")
-    yield from _run(_part(facts.get("parent"), "run"), f"model {model.reference} began with its weights")
-
-
-def _of_leagues(store: Store) -> Found:
-    """Evaluations that entries of leagues cite, with the jobs that made them. Entries need not be sound to be kept."""
-    for name in leagues.names(store):
-        yield from _read(f"league {name}", _of_entries, name, store.leagues / name / "entries")
-
-
-def _of_entries(league: str, folder: Path) -> Found:
-    for number in names_in(folder):
-        yield from _read(
-            f"entry {number} of league {league}", _of_entry, league, number, folder / number / "entry.json"
-        )
-
-
-def _of_entry(league: str, number: str, path: Path) -> Found:
-    entry = read_json(path)
-    if entry is None:
-        yield Unreadable(f"entry {number} of league {league} can't be read ({path} is missing)")
-        return
-    evaluation, by = entry.get("evaluation"), f"entry {number} of league {league} cites it"
-    yield from _run(_part(evaluation, "run"), by)
-    if isinstance(job := _part(evaluation, "job"), str):
-        yield Needed("job", job, by)
+    yield from needed_run(facts.get("run"), f"model {model.reference} is of it")
+    yield from needed_run(part(facts.get("parent"), "run"), f"model {model.reference} began with its weights")
 
 
 def _of_runs(store: Store) -> Found:
     """Runs that began with the weights of another, and those that hold the weights of a teacher."""
     for name in names_in(store.path / "runs"):
-        yield from _read(f"run {name}", _of_run, name, store.path / "runs" / name)
+        yield from read(f"run {name}", _of_run, name, store.path / "runs" / name)
 
 
 def _of_run(name: str, path: Path) -> Found:
     if is_there(path / "parent"):
         described = read_json(path / "run.json", LARGEST_DESCRIPTION) or {}
-        yield from _run(_part(described.get("parent"), "run"), f"run {name} is a clone of it")
+        yield from needed_run(part(described.get("parent"), "run"), f"run {name} is a clone of it")
     if is_there(path / "teachers"):
         for teacher in names_in(path / "teachers"):
-            yield from _run(teacher, f"it is the teacher of run {name}")
+            yield from needed_run(teacher, f"it is the teacher of run {name}")
 
 
-REFERRERS: dict[str, Callable[[Store], Found]] = {"models": _of_models, "leagues": _of_leagues, "runs": _of_runs}
+def _of_orphans(store: Store) -> Found:
+    """Folders of plug-ins that are not installed may need anything."""
+    yield from map(Unreadable, orphans(store))
 
 
-def _part(value: Any, key: str) -> Any:
+def _referrers() -> Iterator[tuple[str, Callable[[Store], Found]]]:
+    yield from (("models", _of_models), ("runs", _of_runs), ("plugins.json", _of_orphans))
+    for name, plugin in plugins().items():
+        if plugin.references:
+            yield name, load(plugin.references)
+
+
+def part(value: Any, key: str) -> Any:
+    """A value of a mapping that anybody may have written; None where there is none."""
     return value.get(key) if isinstance(value, dict) else None
 
 
-def _run(name: Any, by: str) -> Found:
+def needed_run(name: Any, by: str) -> Found:
+    """The run of this name, if it is a name; ``by``: as :attr:`Needed.by`."""
     if isinstance(name, str):
         yield Needed("run", name, by)

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from shared_store.contract.plugins import evaluating
 from shared_store.volume.files import DamagedFile, open_regular, write_atomic
 
 LARGEST = 1 << 20
@@ -27,7 +28,6 @@ _OF_REFERENCE = 256
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _HALF = re.compile("[\ud800-\udfff]")
 """A half of a character, which JSON can name and no file can hold."""
-_SECTIONS = ("train", "evaluate", "race")
 
 
 class TextError(ValueError):
@@ -62,7 +62,7 @@ def references(spec: Mapping[str, Any] | None) -> list[Reference]:
     """The texts that a job's spec names by their digests."""
     return [
         Reference(f"{section}.config.{field}", value.get("file", field), value["sha256"])
-        for section in _SECTIONS
+        for section in ("train", *evaluating())
         for field, value in _config(spec, section)
         if is_reference(value)
     ]
@@ -73,7 +73,7 @@ def beside(spec: Mapping[str, Any]) -> tuple[dict[str, Any], dict[Reference, str
     result, texts = dict(spec), dict[Reference, str]()
     found = [
         (size_in_definition(value), section, field, value)
-        for section in _SECTIONS
+        for section in ("train", *evaluating())
         for field, value in _config(spec, section)
         if isinstance(value, Mapping) and value.keys() <= {"file", "text"} and isinstance(value.get("text"), str)
     ]
@@ -119,7 +119,7 @@ def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str
 def resolved_spec(spec: Mapping[str, Any], *directories: Path) -> dict[str, Any]:
     """A job's spec with the texts in the place of their references, to be shown: a text that none of the directories has is left out."""
     result = dict(spec)
-    for section in _SECTIONS:
+    for section in ("train", *evaluating()):
         config = dict(_config(spec, section))
         for directory in directories:
             for field, value in config.items():

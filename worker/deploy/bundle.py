@@ -8,7 +8,7 @@
 ``report.json``     how the files were compared with the trained policy, and how both did on the same worlds
 ``leapp.yaml``      the same inputs and outputs as NVIDIA's LEAPP describes them (:mod:`worker.deploy.leapp_description`)
 ``robot/``          the robot's model, where its licence allows a copy
-``*.json``          what the task says besides, such as the racer's ``model_metadata.json``
+``*.json``          what the task and plug-ins say besides
 ``README.md``       what is what, and licences
 ``manifest.json``   where the policy comes from, versions, and the SHA-256 of every other file
 ==================  ==========================================================================================================
@@ -33,6 +33,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from shared_store import __version__
+from shared_store.contract.plugins import load, plugins
 from shared_store.contract.policy import Contract
 from shared_store.volume.bundles import CONTRACT, REPORT, publish, seal
 from shared_store.volume.checkpoints import Checkpoint
@@ -185,7 +186,9 @@ def _publish(
         write_json(hidden / REPORT, report)
         (hidden / LEAPP).write_text(leapp_description(files.onnx, contract))
         robot = add_robot(task, hidden)
-        documents = task.bundle_documents(facts.get("algorithm", "")) if isinstance(task, DeclaredTask) else {}
+        documents = dict(task.bundle_documents(facts.get("algorithm", ""))) if isinstance(task, DeclaredTask) else {}
+        for place in (plugin.bundle_parts for plugin in plugins().values() if plugin.bundle_parts):
+            documents |= load(place)(task)
         for name, document in documents.items():
             write_json(hidden / name, document)
         (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot, list(documents)))

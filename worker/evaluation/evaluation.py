@@ -7,12 +7,20 @@ import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 
 from shared_store.volume.checkpoints import best_evaluated, list_checkpoints
-from shared_store.volume.evaluations import by_checkpoint, checkpoint_of, evaluation_name, in_one_line, list_evaluations
+from shared_store.volume.evaluations import (
+    by_checkpoint,
+    checkpoint_of,
+    evaluation_name,
+    in_one_line,
+    kind_of,
+    list_evaluations,
+)
 from shared_store.volume.files import write_json
 from shared_store.volume.layout import Run
 from shared_store.volume.paired_episodes import are_paired, paired, read_returns
@@ -25,7 +33,6 @@ from worker.learning.report import shown_of
 from worker.tasks.compile.tables import as_json
 
 if TYPE_CHECKING:
-    from racer.race.trials import Race
     from worker.tasks.run.task import Task
 
 FORMAT = 1
@@ -108,13 +115,15 @@ class Evaluation:
             "seconds": self.seconds,
         }
 
-    def write(self, run: Run, job: str = "", race: Race | None = None, **facts: Any) -> dict[str, Any]:
+    def write(
+        self, run: Run, job: str = "", judged: Mapping[str, Judged] | None = None, **facts: Any
+    ) -> dict[str, Any]:
         """Write the table, then the summary, which is also returned. Raises OSError.
 
         Args:
             run: The run that was evaluated.
             job: Id of the job that did nothing else; it names the files.
-            race: What the episodes are the trials of; its step logs are written before the table.
+            judged: By the key of the job's section, what the episodes were by its rules; its files are written before the table.
             **facts: What else the summary says.
         """
         name = evaluation_name(self.checkpoint, job)
@@ -125,20 +134,20 @@ class Evaluation:
             "table": f"{name}.parquet",
             "time": time.time(),
         }
-        if race is not None:
-            summary["race"] = race.summary()
+        summary |= {key: each.summary() for key, each in (judged or {}).items()}
         earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]
         earlier = [
-            each for each in earlier if ("race" in each) == (race is not None) and _rewards(each) == _rewards(summary)
+            each for each in earlier if kind_of(each) == kind_of(summary) and _rewards(each) == _rewards(summary)
         ]
         if earlier:
             summary["compared"] = self._compared(run, _partner(earlier, summary), summary)
         summary = _finite(summary)
-        if race is not None:
-            race.write_sim_traces(run.evaluations / name)
+        further: dict[str, list[Any]] = {}
+        for each in (judged or {}).values():
+            each.write(run.evaluations / name)
+            further |= each.columns()
         known = {"run": run.name, "checkpoint": self.checkpoint, "task": self.task, "config": self.config}
-        further = race.columns() if race else None
-        write_table(run.evaluations / summary["table"], self.played, self.seed, known, further)
+        write_table(run.evaluations / summary["table"], self.played, self.seed, known, further or None)
         write_json(run.evaluations / f"{name}.json", summary)
         return summary
 
@@ -167,6 +176,41 @@ class Evaluation:
             return paired(self.played.returns.tolist(), read_returns(run.evaluations / f"{old['name']}.parquet"))
         except (OSError, ValueError):  # its table is gone, or damaged
             return None
+
+
+class Judged(Protocol):
+    """What the episodes of a job were by the rules of its section."""
+
+    def summary(self) -> dict[str, Any]:
+        """As JSON values, for the evaluation's summary."""
+
+    def columns(self) -> dict[str, list[Any]]:
+        """Further columns of the evaluation's table, a value for each episode."""
+
+    def write(self, folder: Path) -> None:
+        """Write further files into the directory of the evaluation. Raises OSError."""
+
+
+class Watcher(Protocol):
+    """Looks on while the episodes of a job are played whose section has rules of its own, one in each world.
+
+    ``task``: at the start of the episodes.
+    """
+
+    def __init__(self, task: Any) -> None: ...
+
+    def note(self, running: torch.Tensor) -> None:
+        """Called after each control step with the worlds whose episode had not ended before it, shape ``(worlds,)``, bool."""
+
+    def result(self, played: Episodes, section: Mapping[str, Any], seed: int, facts: Mapping[str, Any]) -> Judged:
+        """What the episodes were.
+
+        Args:
+            played: How each ended.
+            section: Of the job.
+            seed: Of the worlds.
+            facts: The checkpoint's manifest.
+        """
 
 
 def evaluate(task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episodes: int | None = None) -> Evaluation:
@@ -219,7 +263,8 @@ def _partner(earlier: Sequence[dict[str, Any]], new: Mapping[str, Any]) -> dict[
 def _rewards(summary: Mapping[str, Any]) -> list[Any]:
     """What an evaluation rewarded: returns of other rewards can't be compared."""
     terms, changes = summary.get("rewards") or {}, summary.get("config") or {}
-    return [{name: term.get("weight") for name, term in terms.items()}, changes.get("reward_function")]
+    own = {key: value for key, value in changes.items() if key.startswith("reward")}
+    return [{name: term.get("weight") for name, term in terms.items()}, own]
 
 
 def _finite(value: Any) -> Any:

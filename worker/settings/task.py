@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import field, fields
 from types import MappingProxyType
 from typing import Annotated, Any, ClassVar
@@ -13,6 +13,7 @@ from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationE
 from pydantic.dataclasses import dataclass
 
 from shared_store.contract.error_text import nearest, shown
+from shared_store.volume.layout import Store
 from worker.settings.overrides import Refused, configured, expecting, from_mapping, refused, training_sections
 from worker.settings.ppo import PPOConfig
 
@@ -210,8 +211,6 @@ class TaskConfig(_Common):
     further_groups: ClassVar[Mapping[str, bool]] = MappingProxyType({})
     """Observation groups besides ``policy`` and ``critic``, and whether each holds images, such as ``{"camera": True}``; also ``policy``,
     if a declaration makes it an image. Submission checks jobs against these names."""
-    races: ClassVar[bool] = False
-    """Whether an episode is a lap of a race, as a job with ``race`` runs it."""
     may_change: ClassVar[tuple[str, ...]] = ()
     """Fields that change nothing of a training, so that a run may go on with other values."""
     hyperparameters: ClassVar[tuple[str, ...]] = ()
@@ -247,6 +246,16 @@ class TaskConfig(_Common):
             Refused: A hyperparameter can't be used, or the task has none.
         """
         raise Refused(("hyperparameters",), f"{cls.__name__} has none; settings of PPO stand under train.ppo")
+
+    @classmethod
+    def stored_names(cls, overrides: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+        """What a job's ``train.config`` names in the store: key and name, for :meth:`missing`."""
+        yield from ()
+
+    @classmethod
+    def missing(cls, store: Store, key: str, name: str) -> str | None:
+        """Why the store can't give what ``key`` names, in one line; None: it can."""
+        return None
 
     def notes(self, algorithm: str) -> list[str]:
         """A line for each value that is taken but not meant, or not done, exactly so; told at the submission.

@@ -14,7 +14,7 @@ from orchestrator.persistence.models import JobDefinition
 from orchestrator.services import permissions
 from orchestrator.services.arns import definition_arn, plain_name
 from orchestrator.services.context import Context
-from orchestrator.services.definitions import register
+from orchestrator.services.definitions import revision
 from orchestrator.services.permissions import Actor, Operation
 
 _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
@@ -39,7 +39,8 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
     gang = rules.check_nodes(properties, kind)
     fargate.check_platform(request, properties, f"job definition {name}")
     document = {key: value for key, value in request.items() if key != "tags"}
-    added = register(context, name, document, gang, request.get("tags"))
+    added = revision(context, name, document, gang, request.get("tags"))
+    context.session.add(added)
     arn = definition_arn(name, added.revision)
     return {"jobDefinitionName": name, "jobDefinitionArn": arn, "revision": added.revision}
 

@@ -27,7 +27,8 @@ from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import JobsOf, Operation
 from orchestrator.services.sources import sources_of
-from racer.control.racing_tracks import check_tracks
+from orchestrator.services.stored_names import check_training
+from shared_store.contract import plugins
 
 router = APIRouter(route_class=StoreRoute)
 
@@ -47,10 +48,10 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """The processes that a job would start, and their hosts, if all hosts were free. Nothing is registered and nothing starts."""
     controller, actor = controller_of(request), actor_of(request)
     wanted, definition = _gang_of(body), body.definition
-    check_tracks(controller.access.store, wanted.spec)
+    check_training(controller.access.store, wanted.spec)
     for source in sources_of(wanted):
         run = permitted_run(controller, actor, source.run, Operation.READ_RUN)
-        if source.key in ("evaluate", "race"):
+        if source.key in plugins.evaluating():
             check_evaluation(controller.access.store, run, wanted.spec or {}, source.key)
     controller.engines.capacity(patience=FRESH)  # before the transaction, which must not wait for an engine
     with controller.database.session() as session:
@@ -109,7 +110,7 @@ def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
     controller, actor = controller_of(request), actor_of(request)
     wanted = _gang_of(body)
-    check_tracks(controller.access.store, wanted.spec)
+    check_training(controller.access.store, wanted.spec)
     controller.engines.capacity(patience=FRESH)
     with controller.database.session() as session:
         queue = named_queue(session, actor, body.queue)

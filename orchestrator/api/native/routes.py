@@ -46,7 +46,6 @@ from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import named_definition, queue_names
 from orchestrator.services.damaged_rows import reading
 from orchestrator.services.permissions import Actor, Operation
-from racer.control import league_routes, track_routes
 from shared_store.contract.phases import Phase, phase_in
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
@@ -59,8 +58,6 @@ router.include_router(run_routes.router)
 router.include_router(retention_routes.router)
 router.include_router(text_routes.router)
 router.include_router(model_routes.router)
-router.include_router(league_routes.router)
-router.include_router(track_routes.router)
 router.include_router(webhook_routes.router)
 router.include_router(key_routes.router)
 router.include_router(plan_routes.router)

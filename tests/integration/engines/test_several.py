@@ -421,4 +421,4 @@ def test_jobs_inherit_no_secrets_of_other_engines_from_an_engine_s_commands(
         monkeypatch.setenv(name, "secret")
     assert {name for name, value in slurm_commands.environment().items() if value == "secret"} == {"SLURM_JWT"}
     found = {name for name, value in ray_environment("h:1").items() if value == "secret"}
-    assert found == {"RAY_AUTH_TOKEN", "SLURM_JWT"}
+    assert found == {"RAY_AUTH_TOKEN"}

@@ -96,6 +96,8 @@ def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, m
     monkeypatch.setenv("SBATCH_PARTITION", "closed")
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "7")
     monkeypatch.setenv("FROM_THE_CONTROLLER", "kept")
+    monkeypatch.setenv("OF_THE_CONTROLLER", "not inherited")
+    monkeypatch.setenv("MUSTER_INHERIT", "FROM_THE_CONTROLLER")
     show = "exec python3 -c \"import os, json; print(json.dumps({**os.environ, 'cwd': os.getcwd()}))\""
     variables = {"HARD": hard, "odd.name": "1", "MUSTER_ON_CHILD_FAILURE": "restart"}
     environments = [{**variables, "NODE": str(i)} for i in range(3)]
@@ -118,7 +120,7 @@ def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, m
         assert (env["MASTER_ADDR"], env["MASTER_PORT"]) == (addresses["n1"], told[0]["MASTER_PORT"])
         assert env["CUDA_VISIBLE_DEVICES"] == "0,1", "as Slurm set it"
         assert env["FROM_THE_CONTROLLER"] == "kept" and env["MUSTER_GANG"] == f"{bench.job}/1/1"
-        assert not {"MUSTER_TOKEN", "MUSTER_DATABASE", "SLURM_RESTART_COUNT"} & set(env)
+        assert not {"MUSTER_TOKEN", "MUSTER_DATABASE", "SLURM_RESTART_COUNT", "OF_THE_CONTROLLER"} & set(env)
     assert "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS" not in told[1]
 
 

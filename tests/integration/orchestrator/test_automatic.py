@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 from sqlalchemy import select
 
-from orchestrator.api.batch import submission
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
 from orchestrator.persistence.models import Job
 from orchestrator.server import Server
 from orchestrator.services import automatic_evaluations as automatic
+from orchestrator.services import submission
 from shared_store.volume.checkpoints import list_checkpoints, retain
 from shared_store.volume.evaluations import keep_for_evaluation, wanted_checkpoints
 from tests.conftest import call_muster, submit_gang
@@ -188,7 +188,7 @@ def test_a_stopped_controller_neither_loses_nor_repeats_evaluations(
     class Killed(BaseException):
         """Nothing after it is done."""
 
-    def killed(*_: object) -> None:
+    def killed(*_: object, **__: object) -> None:
         raise Killed
 
     controller.train({"every": 1})

@@ -124,9 +124,9 @@ REFUSED = {
     "taught --set train.ppo.lr=1": r"clone of run taught: train\.ppo\.lr: unknown key",
     "taught --set name=y": "--set name=y: a clone has the name that --name gives it",
     "taught --nodes 9": "clone x: ",
-    "taught --queue nowhere": "Job queue nowhere does not exist",
+    "taught --queue nowhere": "there is no queue 'nowhere'; there is default",
     # before the weights are read: those of iteration 4 are damaged
-    "altered --queue nowhere": "Job queue nowhere does not exist",
+    "altered --queue nowhere": "there is no queue 'nowhere'; there is default",
     "taught --queue default --engine local": "leave one of them out",
 }
 """What is refused of a clone ``x``, and how."""

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from orchestrator.control import monitoring
 from orchestrator.control.attempts import Attempts
 from orchestrator.control.exposition import exposition
 from orchestrator.domain.attempt import State
@@ -99,7 +98,7 @@ def test_series_of_a_queue_end_with_it(bench: Bench) -> None:
 def test_a_bounded_number_of_trainings_has_series_and_the_others_are_counted(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(monitoring, "_TRAININGS", 2)
+    monkeypatch.setattr("orchestrator.control.exposition._TRAININGS", 2)
     names = ["a", "b", "c", "command"]
     bench.submit(*names, node_properties=properties(1, 1))
     for name in names:

@@ -139,10 +139,12 @@ def test_nodes_get_contract_environment_and_gpus(bench: LocalBench, monkeypatch:
     own = (
         *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_DATABASE", "PGPASSWORD"),
         *("AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"),  # of the other engines
+        "UNKNOWN",
     )
     for name in own:
         monkeypatch.setenv(name, "/the/controller's/own")
     monkeypatch.setenv("INHERITED", "yes")
+    monkeypatch.setenv("MUSTER_INHERIT", "INHERITED PGPASSWORD")
     monkeypatch.setenv("AWS_ACCESS_KEY_ID", "the controller's")
     gang = bench.gang(
         nodes=2,

@@ -323,7 +323,7 @@ def test_tracks_are_made_imported_drawn_and_listed(shared_server: Serving, tmp_p
     said = refused("import", str(tmp_path / "broken.npy"), "--name", "broken")
     assert f"{tmp_path}/broken.npy: centre line: row 9" in said
 
-    (store.tracks / "copy" / "manifest.json").unlink()
+    (store.path / "tracks" / "copy" / "manifest.json").unlink()
     listed = json.loads(call_muster("tracks", "list", "--json", home=home).stdout)
     assert [each["name"] for each in listed] == ["oval", "rounded-rectangle", "chicane", "copy", "hills"]
     assert "copy is damaged" in listed[3]["problem"] and listed[4]["origin"] == {"seed": 7, "length": 40.0}

@@ -242,7 +242,7 @@ def test_a_damaged_epoch_file_is_reported_in_one_line(node: Nodes) -> None:
 def test_a_store_that_is_not_the_controllers_is_reported_before_any_start(node: Nodes, tmp_path: Path) -> None:
     n = node(epoch=3)
     (tmp_path / "other" / "runs").mkdir(parents=True)
-    main = "import sys; from shared_store import epoch; epoch.find_epoch.__defaults__ = (0.5,); "
+    main = "import sys; from shared_store.volume import epoch; epoch.find_epoch.__defaults__ = (0.5,); "
     main += "from worker.node.supervisor import main; sys.exit(main(sys.argv[1:]))"
     n.start("touch", str(tmp_path / "started"), program=("-c", main), MUSTER_STORE=str(tmp_path / "other"))
     assert n.wait() == 2

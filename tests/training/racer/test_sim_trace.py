@@ -180,7 +180,7 @@ def test_deepracer_utils_reads_a_race_with_the_training_beside_it_from_what_the_
     laps = Laps(task)
     (policy,) = load_policies(checkpoint, "cpu", 1)
     played = play([task], policy, alone(), look=laps.note)
-    laps.race(played, rules_of({}), 5, checkpoint.manifest).write_sim_traces(run.evaluations / "00000006-e1-job")
+    laps.race(played, rules_of({}), 5, checkpoint.manifest).write(run.evaluations / "00000006-e1-job")
     _copy(run.path, "00000006-e1-job", tmp_path / "race", quiet=True)
     log = DeepRacerLog(str(tmp_path / "race"))
     log.load_evaluation_trace()

@@ -44,14 +44,14 @@ def test_a_league_is_never_changed(store: Store, cup: StoredLeague, monkeypatch:
             leagues.create(store, league(seed=8))
         monkeypatch.setattr(leagues, "names", lambda store: [])  # it looked before the other one was done
     assert cup.definition().seed == 7
-    assert os.listdir(store.leagues) == ["cup"], "nothing half made is left"
+    assert os.listdir(store.path / "leagues") == ["cup"], "nothing half made is left"
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", ".hidden", "a b", "x" * 129, "a\n"])
 def test_a_name_that_can_be_no_directory_is_refused(store: Store, name: str) -> None:
     with pytest.raises(LeagueError, match=r"^league name .*: use letters, digits"):
         leagues.create(store, league(name))
-    assert not store.leagues.exists()
+    assert not (store.path / "leagues").exists()
 
 
 def test_an_unknown_league_or_entry_is_reported_with_the_existing_ones(store: Store) -> None:
@@ -258,7 +258,7 @@ def test_the_tracks_of_a_league_can_not_change(store: Store) -> None:
     assert leagues.digest_of_track(store, "hills") == "first"
     hilly = league(track=("hills",), track_digests={"hills": "first"})
     hilly.check_tracks(store)
-    shutil.rmtree(store.tracks / "hills")
+    shutil.rmtree(store.path / "tracks" / "hills")
     with pytest.raises(LeagueError, match=r"^track hills does not exist"):
         hilly.check_tracks(store)
     tracks.add(store, "hills", b"others", {"digest": "second"})
@@ -268,8 +268,8 @@ def test_the_tracks_of_a_league_can_not_change(store: Store) -> None:
 
 def test_links_out_of_the_store_are_not_followed(store: Store, tmp_path: Path) -> None:
     leagues.create(store, league())
-    shutil.rmtree(store.leagues)
-    os.symlink(tmp_path, store.leagues)
+    shutil.rmtree(store.path / "leagues")
+    os.symlink(tmp_path, store.path / "leagues")
     for ask in (lambda: leagues.names(store), lambda: leagues.create(store, league("two"))):
         with pytest.raises(LeagueError, match="links inside a run are not followed"):
             ask()

@@ -134,7 +134,7 @@ def test_the_cause_of_a_trial_s_end_is_its_status(status: str, section: dict[str
 
 def test_a_step_log_has_a_row_a_step_as_deepracer_s_tools_read_it(tmp_path: Path) -> None:
     task, played, race = drive(gain=0.0, trials=1, continuous=True, max_resets=1)
-    race.write_sim_traces(tmp_path / "00000030-e1-job")
+    race.write(tmp_path / "00000030-e1-job")
     (path,) = tmp_path.rglob("*.csv")
     there = "00000030-e1-job/sim-trace/evaluation/00000030-e1-job/evaluation-simtrace/0-iteration.csv"
     assert path == tmp_path / there
@@ -182,7 +182,7 @@ def test_trials_use_the_tracks_in_turn_and_the_table_agrees_with_the_summary(tmp
     assert race.summary()["track"] == ["oval", "chicane"]
     run = Run(tmp_path / "fast")
     run.evaluations.mkdir(parents=True)
-    told = result_of(task, played, "00000030-e1", 5, 0.0).write(run, "job", race)
+    told = result_of(task, played, "00000030-e1", 5, 0.0).write(run, "job", {"race": race})
     assert told["race"] == json.loads((run.evaluations / "00000030-e1-job.json").read_text())["race"]
     table = pyarrow.parquet.read_table(run.evaluations / told["table"]).to_pydict()
     for name, values in table.items():
