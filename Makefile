@@ -55,7 +55,9 @@ without-racer: $(READY)
 	$(BIN)/python -m tests.support.suite.without_racer $(TESTS)
 
 # what reaches plug-ins: specs, services, the store, the command and the pages
-ONCE_WITHOUT_RACER = PLACEHOLDER
+ONCE_WITHOUT_RACER = $(addprefix tests/unit/,orchestrator/spec orchestrator/console orchestrator/cli shared_store test_packages.py) \
+    $(addprefix tests/unit/worker/test_,evaluation.py interface.py task_configs.py) \
+    $(addprefix tests/integration/,conformance/test_permissions.py console/test_submit.py orchestrator/test_cli.py orchestrator/test_evaluate.py)
 
 unit integration: $(READY)
 	$(PYTEST) tests/$@
