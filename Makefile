@@ -3,6 +3,7 @@
 # make test   lint, the unit tests, and every command of the README for real: minutes
 # make check            everything: the tiers below, whose tests also run alone, two lanes beside each other
 # make unit integration training long robots services console engines    one tier of tests; docs/contributing.md says what each is
+# make without-racer    the suite once without the racer's package; TESTS="tests/unit tests/integration" by default
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks, outages
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make mutants          small faults in the pure modules, and in a sample of PPO: which ones do the unit tests not notice?
@@ -17,7 +18,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test check coverage unit integration training long robots services console engines quick rest kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-health bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
+.PHONY: run race test check coverage unit integration training long robots services console engines quick rest without-racer kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-health bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -43,10 +44,20 @@ quick: $(READY)
 check: $(READY) tracking kernels robots-kernels
 	$(MAKE) --no-print-directory test
 	$(MAKE) --no-print-directory rest
+	$(MAKE) --no-print-directory without-racer TESTS="$(ONCE_WITHOUT_RACER)"
 
 # clusters and browsers are one lane, all else is the other
 rest: $(READY)
 	$(PYTEST) tests --ignore tests/unit --ignore tests/cluster/test_readme.py
+
+# a copy of this clone in build/without-racer, whose environment never had the package
+without-racer: $(READY)
+	$(BIN)/python -m tests.support.suite.without_racer $(TESTS)
+
+# what reaches plug-ins: specs, services, the store, the command and the pages
+ONCE_WITHOUT_RACER = $(addprefix tests/unit/,orchestrator/spec orchestrator/console orchestrator/cli shared_store test_packages.py) \
+    $(addprefix tests/unit/worker/test_,evaluation.py interface.py task_configs.py) \
+    $(addprefix tests/integration/,conformance/test_permissions.py console/test_submit.py orchestrator/test_cli.py orchestrator/test_evaluate.py)
 
 unit integration: $(READY)
 	$(PYTEST) tests/$@
