@@ -40,7 +40,6 @@ LAYERS = {
     "service_manager": {"machine"},
     "home": {"domain"},
     "keys": {"domain"},
-    "plugins": {"api", "services"},
     "client": {"domain", "home"},
     "server": {
         *("domain", "engines", "persistence", "control", "services", "api", "console", "plugins", "home", "keys"),
