@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from importlib import import_module
 
@@ -9,6 +10,7 @@ import pytest
 
 import shared_store
 import worker
+from tests.conftest import REPOSITORY
 
 NAMES = {
     **{old: new for old, new in (shared_store.OLD_NAMES | worker.OLD_NAMES).items() if not new.startswith("racer.")},
@@ -32,3 +34,13 @@ def test_what_moved_out_of_what_is_installed_is_not_found_by_its_old_name(monkey
         import_module("worker.gone")
     with pytest.raises(ModuleNotFoundError, match=r"^No module named 'worker\.tasks\.configs\.nothing'$"):
         import_module("worker.tasks.configs.nothing")
+
+
+def test_the_page_of_moved_modules_names_modules_that_are_there_and_marks_the_kept_names() -> None:
+    page = (REPOSITORY / "docs" / "moved-modules.md").read_text()
+    rows = re.findall(r"^\| `([\w.]+)`( \*)? \| `([\w.]+)` \|$", page, re.M)
+    assert len(rows) > 150
+    for old, _, new in rows:
+        place = REPOSITORY / new.replace(".", "/")
+        assert place.with_suffix(".py").is_file() or place.is_dir() or new.startswith("racer."), (old, new)
+    assert {old for old, kept, _ in rows if kept} == {*shared_store.OLD_NAMES, *worker.OLD_NAMES}
