@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from fastapi import APIRouter, Depends, FastAPI, Request
+from starlette.routing import compile_path
 
 from orchestrator.api.http.requests import actor_of
 from orchestrator.services.permissions import AddedOperation, Refusal
@@ -19,14 +20,17 @@ def add_plugins(app: FastAPI) -> None:
 
 
 def _include(app: FastAPI, plugin: Plugin, places: Sequence[str], prefix: str) -> None:
+    declared = [(AddedOperation(each), compile_path(each.partition(" ")[2])[0]) for each in plugin.operations]
+
     def check(request: Request) -> None:
-        operation = AddedOperation(f"{request.method} {request.scope['route'].path}")
-        if operation not in plugin.operations:
-            words = (
-                f"{operation} is refused for every key: its plug-in declares no permission for it (Plugin.operations)"
-            )
-            raise Refusal("AccessDeniedException", words)
-        actor_of(request).check(operation)
+        method, path, route = request.method, request.scope["path"], request.scope["route"].path
+        for operation, pattern in declared:
+            # of an included router, FastAPI tells a route's path without the prefix
+            if operation.startswith(f"{method} ") and operation.endswith(route) and pattern.match(path):
+                actor_of(request).check(operation)
+                return
+        words = f"{method} {prefix}{route.removeprefix(prefix)} is refused for every key: its plug-in declares no permission for it"
+        raise Refusal("AccessDeniedException", f"{words} (Plugin.operations)")
 
     for place in places:
         checked = APIRouter(prefix=prefix, dependencies=[Depends(check)])

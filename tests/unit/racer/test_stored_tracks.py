@@ -32,14 +32,14 @@ def test_a_track_is_never_changed(store: Store, monkeypatch: pytest.MonkeyPatch)
         monkeypatch.setattr(tracks, "names", lambda store: [])  # it looked before the other one was done
     monkeypatch.undo()
     assert tracks.find(store, "hills").read() == b"rows"
-    assert [path.name for path in store.tracks.iterdir()] == ["hills"], "nothing half made is left"
+    assert [path.name for path in tracks.folder_in(store).iterdir()] == ["hills"], "nothing half made is left"
 
 
 @pytest.mark.parametrize("name", ["", "../x", "a/b", ".hidden", "random:7", "x" * 129])
 def test_a_name_that_can_be_no_directory_is_refused(store: Store, name: str) -> None:
     with pytest.raises(TrackError, match="use letters, digits"):
         tracks.add(store, name, b"rows", {})
-    assert not store.tracks.exists()
+    assert not tracks.folder_in(store).exists()
 
 
 def test_an_unknown_track_is_reported_with_the_nearest_name(store: Store) -> None:
@@ -69,7 +69,7 @@ def test_links_out_of_the_store_are_not_followed(store: Store, tmp_path: Path) -
     for read in (tracks.StoredTrack(path).read, tracks.StoredTrack(path).facts):
         with pytest.raises(TrackError, match="links inside a run are not followed"):
             read()
-    shutil.rmtree(store.tracks)
-    os.symlink(tmp_path, store.tracks)
+    shutil.rmtree(tracks.folder_in(store))
+    os.symlink(tmp_path, tracks.folder_in(store))
     with pytest.raises(TrackError, match="links inside a run are not followed"):
         tracks.add(store, "valleys", b"rows", {})
