@@ -312,7 +312,7 @@ def test_a_server_and_short_commands_that_start_together_all_succeed(tmp_path: P
             for command in started:
                 if command is not server:
                     said, errors = command.communicate(timeout=60 * PATIENCE)
-                    assert command.returncode == 0 and json.loads(said), errors
+                    assert command.returncode == 0 and json.loads(said) == [], errors
             assert server.stdout is not None and server.stdout.readline().startswith("Muster serves http")
         finally:
             server.terminate()
