@@ -20,7 +20,7 @@ import httpx
 
 from orchestrator.domain.errors import ApiError, NotServing, NoUrl, Unreachable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.home import local_url, muster_home
+from orchestrator.home import local_controller, muster_home
 from shared_store.volume.texts import digest_of
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
@@ -62,6 +62,8 @@ class Client:
         self.url = url
         self.found = False
         """Whether it is the running controller of the home directory, which no URL named."""
+        self.is_temporary = False
+        """Whether it goes away with the command that started it, which may be any moment."""
         self.successor: Callable[[], Client] | None = None
         """Finds or starts another controller when this one is gone; None: the client waits for this one."""
         self.notify: Callable[[str], object] = lambda line: None
@@ -81,14 +83,15 @@ class Client:
             ApiError: The token is refused.
         """
         found = not (url or os.environ.get("MUSTER_URL"))
-        url = url or os.environ.get("MUSTER_URL") or local_url()
+        here, is_temporary = local_controller() if found else (None, False)
+        url = url or os.environ.get("MUSTER_URL") or here
         if url is None:
             raise Unreachable(
                 f"no controller of {muster_home()} runs; start one with `muster serve`, or set MUSTER_URL to that of another one, "
                 f"such as {EXAMPLE_URL}"
             )
         client = cls(url, os.environ.get("MUSTER_TOKEN"))
-        client.found = found
+        client.found, client.is_temporary = found, is_temporary
         try:
             client.get("/healthz")
         except NotServing:
@@ -218,10 +221,11 @@ class Client:
         try:
             try:
                 answer = send()
-            except (httpx.ReadError, httpx.RemoteProtocolError):
-                if not headers:
+            except (httpx.ConnectError, httpx.ReadError, httpx.RemoteProtocolError) as error:
+                is_gone = self.successor is not None and (method == "GET" or isinstance(error, httpx.ConnectError))
+                if not (is_gone or (headers and not isinstance(error, httpx.ConnectError))):
                     raise
-                # the answer was lost; with its key the same request submits nothing twice
+                # a request that was not sent, or changes nothing, or has its key and so submits nothing twice
                 self.await_return(30, serving=False)
                 answer = send()
         except httpx.HTTPError as error:

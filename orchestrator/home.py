@@ -39,18 +39,18 @@ def muster_home() -> Path:
 
 def local_url() -> str | None:
     """URL at which the controller of this home directory listens; None where it does not run."""
+    return local_controller()[0]
+
+
+def local_controller() -> tuple[str | None, bool]:
+    """:func:`local_url`, and whether that controller goes away with the command that started it."""
     found = _published(muster_home())
-    return str(found["url"]) if found else None
+    return (str(found["url"]), bool(found["temporary"])) if found else (None, False)
 
 
 def local_region() -> str:
     """The AWS region in the ARNs of this home directory's controller; the default one where it does not run."""
     return str((_published(muster_home()) or {}).get("region") or "us-east-1")
-
-
-def is_temporary() -> bool:
-    """Whether the controller of this home directory goes away with the command that started it."""
-    return bool((_published(muster_home()) or {}).get("temporary"))
 
 
 def _published(home: Path) -> dict[str, Any] | None:

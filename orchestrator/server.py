@@ -46,7 +46,6 @@ from orchestrator.plugins import add_plugins
 from orchestrator.services import arns
 from orchestrator.services.automatic_evaluations import AutomaticEvaluations
 from shared_store.volume.layout import Store
-from shared_store.volume.plugin_folders import note_plugins
 
 log = logging.getLogger("muster.controller")
 
@@ -128,7 +127,6 @@ class Server:
                 stack.enter_context(_default_store(home / "store"))
             self.store = Store(store or home / "store")
             self.store.check_writable()
-            note_plugins(self.store)
             try:
                 found = Database(_database_url(database)) if database else Database.at(home)
                 stack.callback(found.close)

@@ -22,7 +22,7 @@ from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable, UsageError
 from orchestrator.domain.retention import rule_of
 from orchestrator.engines.toolkit.environment import INHERIT, PRIVATE
-from orchestrator.home import ControllerRuns, is_temporary, local_url, muster_home
+from orchestrator.home import ControllerRuns, local_url, muster_home
 from orchestrator.spec import file as specfile
 from orchestrator.spec.values import seconds_of
 
@@ -293,10 +293,9 @@ def controller(store: str | None, cpus: float | None, engines: Sequence[str] = (
     with contextlib.ExitStack() as stack:
 
         def connect() -> Client:
-            was_temporary = is_temporary()  # it may go as soon as it was found
             client = stack.enter_context(_controller(store, cpus, engines))
             # a service comes back by itself, with its own options; none of this command's may take its place
-            client.successor = connect if was_temporary or is_temporary() else None
+            client.successor = connect if client.is_temporary else None
             return client
 
         yield connect
@@ -358,6 +357,7 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
     server.start()
     try:
         with Client(server.url, server.access.own_token) as client:  # it may require a key that this command lacks
+            client.is_temporary = True
             yield client
     finally:
         server.close()

@@ -11,7 +11,9 @@ from sqlalchemy.orm import Session
 from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.models import Attempt, Job
 from orchestrator.persistence.own_models import KnownStore
+from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Store, StoreError
+from shared_store.volume.plugin_folders import note_plugins
 
 _NEWEST = 100
 """How many of the newest runs of a database are looked for in a store without an identity."""
@@ -79,6 +81,10 @@ def recognise(session: Session, store: Store, adopt: bool) -> StoreIdentity:
             raise StoreError(f"store {store.path}: none of the runs of this controller's jobs is there; {_REMEDY}")
     identity = store.open().identity()
     assert identity is not None
+    try:
+        note_plugins(store)
+    except (OSError, DamagedFile) as error:
+        raise StoreError(f"store {store.path}: plugins.json can't be written ({error})") from error
     session.merge(KnownStore(id=1, identity=identity))
     return StoreIdentity(store, identity)
 

@@ -109,7 +109,7 @@ class Job:
         for name in ("MUSTER_STORE", "MUSTER_RUN", "MUSTER_SPEC"):
             if not env.get(name):
                 raise UserError(
-                    f"{name} is not set: `python -m worker.{kind}` is started by Muster (use `muster run SPEC`)"
+                    f"{name} is not set: a rank that does `{kind}` is started by Muster (use `muster run SPEC`)"
                 )
         try:
             spec = json.loads(env["MUSTER_SPEC"])
