@@ -26,13 +26,13 @@ from orchestrator.api.http.limits import RateLimit
 from orchestrator.api.http.requests import actor_of
 from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
-from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from tests.conftest import PATIENCE, Serving, call_muster, run_muster
 from tests.support.conformance.keys import client, refused
 from tests.support.conformance.streams import client_of
+from tests.support.keys import HomeKeys
 
 
 def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -> None:
@@ -42,7 +42,7 @@ def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     listed = call_muster("keys", "list", "--json", home=tmp_path).stdout
     assert json.loads(listed)[0] == {key: value for key, value in created.items() if key != "secretAccessKey"}
-    for text in (listed, call_muster("keys", "list", home=tmp_path).stdout, repr(KeyStore(tmp_path).load())):
+    for text in (listed, call_muster("keys", "list", home=tmp_path).stdout, repr(HomeKeys(tmp_path).load())):
         assert created["accessKeyId"] in text and created["secretAccessKey"] not in text
     path.chmod(0o640)
     for command in (["serve", "--port", "0"], ["keys", "list"], ["keys", "create", "b"]):
@@ -61,10 +61,10 @@ def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -
     ],
 )
 def test_wrong_uses_of_the_command_end_with_one_line(tmp_path: Path, arguments: list[str]) -> None:
-    KeyStore(tmp_path).create("a")
+    HomeKeys(tmp_path).create("a")
     done = call_muster("keys", *arguments, home=tmp_path)
     assert done.returncode == 2 and done.stderr.startswith("muster: ") and done.stderr.count("\n") == 1, done.stderr
-    assert [each.name for each in KeyStore(tmp_path).load().values()] == ["a"]
+    assert [each.name for each in HomeKeys(tmp_path).load().values()] == ["a"]
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,7 @@ def test_a_damaged_keys_file_is_one_line_at_the_start(tmp_path: Path, text: byte
 def test_a_keys_file_damaged_later_is_logged_and_its_keys_stay(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    store = KeyStore(tmp_path)
+    store = HomeKeys(tmp_path)
     key = store.create("a")
     good = store.path.read_bytes()
     assert list(store.current()) == [key.access_key_id]
@@ -106,7 +106,7 @@ def test_a_keys_file_damaged_later_is_logged_and_its_keys_stay(
 
 
 def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path)
+    store = HomeKeys(tmp_path)
     with Serving(tmp_path, "--cpus", "1") as server:
         assert httpx.get(f"{server.url}/api/runs", headers={"Authorization": "AWS4-HMAC-SHA256 x"}).status_code == 200
         client(server.url, "any", "any").list_jobs(jobQueue="default")
@@ -122,7 +122,7 @@ def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
 def test_off_loopback_a_key_is_demanded_and_other_web_pages_are_refused(tmp_path: Path) -> None:
     done = call_muster("serve", "--host", "0.0.0.0", "--port", "0", home=tmp_path)
     assert done.returncode == 1 and "muster keys create" in done.stderr and done.stderr.count("\n") == 1, done.stderr
-    key = KeyStore(tmp_path).create("a")
+    key = HomeKeys(tmp_path).create("a")
     with Serving(tmp_path, "--host", "0.0.0.0", "--cpus", "1") as server:
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
         bearer = {"Authorization": f"Bearer {key.access_key_id}:{key.secret}"}
@@ -164,7 +164,7 @@ def test_a_token_or_a_proxy_that_is_not_safe_is_refused_at_the_start(tmp_path: P
     ):
         with pytest.raises(ServerError, match=f"--trust-proxy: {said}"):
             Server(tmp_path, trusted_proxies=[proxy])
-    key = KeyStore(tmp_path).create("wall", read_only=True)
+    key = HomeKeys(tmp_path).create("wall", read_only=True)
     with pytest.raises(ServerError, match=f"MUSTER_TOKEN is the key {key.access_key_id} of a client"):
         Server(tmp_path, token=f"{key.access_key_id}:{key.secret}")
 
@@ -210,7 +210,7 @@ def test_a_home_is_its_users_alone_and_an_open_one_is_closed(tmp_path: Path, cap
 
 
 def test_the_application_sees_who_asks(tmp_path: Path) -> None:
-    key = KeyStore(tmp_path).create("a", ("robots",), read_only=True)
+    key = HomeKeys(tmp_path).create("a", ("robots",), read_only=True)
 
     def who(request: Request) -> JSONResponse:  # in another thread, as all our operations are
         actor = actor_of(request)
@@ -223,7 +223,7 @@ def test_the_application_sees_who_asks(tmp_path: Path) -> None:
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
             return (await http.get("/", headers={"Authorization": f"Bearer {token}"})).json()
 
-    access = Access(KeyStore(tmp_path), "the-token")
+    access = Access(HomeKeys(tmp_path), "the-token")
     assert asyncio.run(ask(access, f"{key.access_key_id}:{key.secret}")) == ["key a", ["robots"], True]
     assert asyncio.run(ask(access, "the-token")) == ["MUSTER_TOKEN", [], False]
     assert asyncio.run(ask(access, access.own_token)) == ["this process", [], False]
@@ -231,7 +231,7 @@ def test_the_application_sees_who_asks(tmp_path: Path) -> None:
 
 
 def test_muster_run_gets_into_the_controller_that_it_brings(tmp_path: Path) -> None:
-    KeyStore(tmp_path).create("a")
+    HomeKeys(tmp_path).create("a")
     spec = tmp_path / "job.yaml"
     spec.write_text("name: own\nresources: {cpus: 0.1}\ncommand: ['true']\n")
     assert "MUSTER_TOKEN" not in os.environ

@@ -9,10 +9,10 @@ import httpx
 import pytest
 
 from orchestrator.console.pages import NAVIGATION
-from orchestrator.keys import KeyStore
 from tests.conftest import Serving
 from tests.support.console.fixtures import Console, secret_of
 from tests.support.console.visitor import Page, Visitor
+from tests.support.keys import HomeKeys
 
 
 def test_a_browser_without_a_session_is_sent_to_the_login_and_back(console: Console) -> None:
@@ -66,7 +66,7 @@ def test_a_logged_out_session_is_over_wherever_it_was_copied_to(console: Console
 
 
 def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_path: Path) -> None:
-    keys = KeyStore(tmp_path)
+    keys = HomeKeys(tmp_path)
     keys.create("other")
     key = keys.create("mine")
     with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url, secret_of(key))) as visitor:
@@ -263,13 +263,13 @@ def test_the_first_key_is_made_after_a_warning_and_from_then_on_everybody_needs_
         asked = post(visitor, "/keys/create", name="first")
         assert asked.status_code == 409 and "everybody needs a key, you too" in Page(asked.text).text
         made = post(visitor, "/keys/create", name="first", confirmed="yes")
-        (key,) = KeyStore(tmp_path).load().values()
+        (key,) = HomeKeys(tmp_path).load().values()
         assert key.secret in made.text
         assert visitor.http.get("/keys", follow_redirects=False).headers["location"].startswith("/login")
 
 
 def test_a_server_that_other_machines_can_reach_shows_keys_and_makes_none(tmp_path: Path) -> None:
-    keys = KeyStore(tmp_path)
+    keys = HomeKeys(tmp_path)
     secret = secret_of(keys.create("admin"))
     with (
         Serving(tmp_path, "--cpus", "1", "--host", "0.0.0.0") as server,

@@ -8,15 +8,16 @@ import pytest
 
 from orchestrator.api.http import access
 from orchestrator.api.http.access import Access
-from orchestrator.keys import KeyStore
+from orchestrator.persistence.access_keys import KeyStore
 from orchestrator.services.permissions import Actor, Refusal
+from tests.support.keys import key_store
 
 SECRET = bytes(32)
 
 
 @pytest.fixture
 def keys(tmp_path: Path) -> KeyStore:
-    return KeyStore(tmp_path)
+    return key_store(tmp_path)
 
 
 def given(keys: KeyStore, name: str) -> str:
