@@ -1,4 +1,4 @@
-"""The tables of what a controller is and keeps: its clock, store, account, keys, secrets, texts, messages, log groups, uses of runs and queues.
+"""The models of what a controller is and keeps: its clock, store, account, keys, secrets, texts, messages, log groups, uses of runs and queues.
 
 Jobs are in :mod:`.models`.
 """

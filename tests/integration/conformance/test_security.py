@@ -220,6 +220,10 @@ def test_keys_come_and_go_without_a_restart(served: Serving, home: Path) -> None
     batch = client(served.url, passing.access_key_id, passing.secret)
     batch.list_jobs(jobQueue="default")
     assert call_muster("keys", "delete", "passing", home=home).returncode == 0
+    bearer = {"Authorization": f"Bearer {passing.access_key_id}:{passing.secret}"}
+    wait_for(
+        lambda: httpx.get(f"{served.url}/api/runs", headers=bearer).status_code == 403, what="the look at the keys"
+    )
     with pytest.raises(ClientError) as caught:
         batch.list_jobs(jobQueue="default")
     assert code(caught)[0] == "UnrecognizedClientException"

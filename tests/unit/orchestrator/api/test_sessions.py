@@ -29,7 +29,7 @@ def test_a_session_has_the_rights_of_its_key_as_they_are_now(keys: KeyStore) -> 
     keys.create("a", ("robots",), read_only=True)
     here = Access(keys, console_secret=SECRET)
     session = here.sign_in(given(keys, "a"))
-    assert here.session(session) == Actor("key a", frozenset({"robots"}), True)
+    assert here.session(session) == Actor("key a", frozenset({"robots"}), True, "a")
     keys.delete("a")
     keys.create("a")
     assert here.session(session) is None, "another key of the same name"
