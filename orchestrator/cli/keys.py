@@ -10,6 +10,8 @@ from typing import Annotated
 
 import typer
 from rich.table import Table
+from sqlalchemy import make_url
+from sqlalchemy.exc import ArgumentError
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
@@ -128,26 +130,31 @@ def opened(home: Path, database: str | None = None) -> Iterator[KeyStore]:
 
     Raises ServerError.
     """
-    running = local_database(home)
-    if running is not None and running != shown(database_url(home, database)):
-        raise UsageError(
-            f"the controller of {home} has its keys in {running}: give that with --database, or as MUSTER_DATABASE"
-        )
     with contextlib.ExitStack() as stack:
         try:
             try:
                 stack.callback(HomeLock(home, temporary=True).release)
                 found = Database.at(home, database)
             except (ControllerRuns, DatabaseTaken):
+                _check_same(home, database)
                 found = Database.at(home, database, beside=True)
             stack.callback(found.close)
             own = OwnSecrets(found, home)
             keys = KeyStore(own)
             move_in(home, own, keys)
             yield keys
-        except Unavailable as error:
+        except (Unavailable, ArgumentError) as error:
             raise ServerError(str(error)) from None
         except OSError as error:
             raise ServerError(
                 f"{home}: can't be used ({error.strerror}); set MUSTER_HOME to a directory that can be written"
             ) from None
+
+
+def _check_same(home: Path, database: str | None) -> None:
+    """Raises UsageError where the controller that runs on this home directory has another database."""
+    running = local_database(home)
+    if running is not None and running != shown(str(make_url(database_url(home, database)))):
+        raise UsageError(
+            f"the controller of {home} has its keys in {running}: give that with --database, or as MUSTER_DATABASE"
+        )

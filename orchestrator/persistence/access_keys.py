@@ -10,7 +10,6 @@ import re
 import secrets
 import string
 import threading
-import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -24,6 +23,7 @@ from orchestrator import machine
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError
 from orchestrator.persistence.own_models import AccessKey
 from orchestrator.persistence.own_secrets import OwnSecrets
+from orchestrator.persistence.sealing import SealError
 from shared_store.volume.layout import NAME
 
 INTERVAL = 1.0
@@ -86,23 +86,28 @@ class KeyStore:
     """
 
     def __init__(self, own: OwnSecrets) -> None:
-        """Raises KeysError, SealError, DatabaseError."""
+        """Raises DatabaseError."""
         self._database, self._seal = own.database, own.seal
         self._looking = threading.Lock()
         self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
         self._looked = 0.0
         """When the last look began (monotonic [s])."""
         self._rows: Sequence[Row[Any]] = ()
         self._keys: Mapping[str, Key] = {}
-        self._failing = False
         self._look()
 
     def current(self) -> Mapping[str, Key]:
         """The keys by access key id, as they were at the last look; cheap enough for every request."""
         return self._keys
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether the database had no key, not even a damaged one, at the last look."""
+        return not self._rows
+
     def load(self) -> Mapping[str, Key]:
-        """The keys by access key id, as the database has them now. Raises SealError, DatabaseError."""
+        """The keys by access key id, as the database has them now. Raises DatabaseError."""
         with self._looking:
             self._look()
         return self._keys
@@ -112,7 +117,7 @@ class KeyStore:
 
         Where the database does not answer in time, what was read last stays in force.
         """
-        asked = time.monotonic()
+        asked = machine.monotonic()
         if self._looking.acquire(timeout=PATIENCE):
             try:
                 if self._looked <= asked:
@@ -122,11 +127,13 @@ class KeyStore:
 
     def start(self) -> None:
         """Look every second from now on."""
-        machine.thread("keys", self._loop)
+        self._thread = machine.thread("keys", self._loop)
 
     def close(self) -> None:
         """Look no more."""
         self._ending.set()
+        if self._thread is not None:
+            self._thread.join(PATIENCE)
 
     def create(
         self, name: str, queues: Sequence[str] | None = None, read_only: bool = False, share: str | None = None
@@ -159,7 +166,7 @@ class KeyStore:
             queues=tuple(dict.fromkeys(queues)) if queues else None,
             read_only=read_only,
             share=share or share_of_name(name),
-            created_at=int(time.time() * 1000),
+            created_at=int(machine.wall() * 1000),
         )
         try:
             with self._database.session() as session:
@@ -192,26 +199,28 @@ class KeyStore:
     def _look_safely(self) -> None:
         try:
             self._look()
-        except (ServerError, Unavailable) as error:
-            if not self._failing:
-                log.error("%s (until then the %d keys that were read last stay in force)", error, len(self._keys))
-            self._failing = True
+        except Unavailable:
+            pass  # said by the controller; the keys that were read last stay in force
 
     def _look(self) -> None:
         """Read the rows, and open them where they have changed."""
-        self._looked = time.monotonic()
+        self._looked = machine.monotonic()
         with self._database.session() as session:
             rows = session.execute(select(_TABLE).order_by(_TABLE.c.created_at, _TABLE.c.name)).all()
         if rows != self._rows:
-            self._keys = {row.access_key_id: self._opened(row) for row in rows}
+            self._keys = {key.access_key_id: key for row in rows if (key := self._opened(row))}
             self._rows = rows
-        self._failing = False
 
-    def _opened(self, row: Row[Any]) -> Key:
+    def _opened(self, row: Row[Any]) -> Key | None:
+        """The key of a row; None of a damaged one, which is refused: the others stay in force."""
         facts = {name: value for name, value in row._mapping.items() if name != "sealed"}
         try:
             return Key(**facts, secret=self._seal.open(row.sealed, f"the secret of key {row.name}"))
-        except ValidationError:
-            raise KeysError(
-                f"key {row.name[:128]} is damaged in the database: delete it (muster keys delete {row.name[:128]}), and create it again"
-            ) from None
+        except (ValidationError, SealError):
+            name = row.name[:128]
+            log.error(
+                "key %s is damaged in the database, and is refused: muster keys delete %s, and create it again",
+                name,
+                name,
+            )
+            return None

@@ -54,9 +54,9 @@ class Access:
             self.keys.look_again()
 
     def demanded(self) -> bool:
-        """Whether requests must be authenticated. Once keys have existed this stays so: deleting them opens nothing."""
+        """Whether requests must be authenticated. Once keys have existed this stays so: deleting or damaging them opens nothing."""
         if not self.exposed:
-            self.exposed = bool(self.token or self.known())
+            self.exposed = bool(self.token or (self.keys and not self.keys.is_empty))
         return self.exposed
 
     def admitted(self) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -221,6 +222,7 @@ def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path:
         assert set(modes.values()) == {0o600}, modes
         first.close()
         path.chmod(0o644)
+        shutil.copy2(tmp_path / "a" / "sealing.key", tmp_path / "b")
         Server(tmp_path / "b", store=store, database=how.format(path)).close()
         assert path.stat().st_mode & 0o777 == 0o600
     finally:

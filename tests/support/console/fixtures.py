@@ -10,11 +10,12 @@ import pytest
 
 from orchestrator.client import Client
 from orchestrator.persistence.access_keys import Key
-from tests.conftest import Serving, wait_for
+from tests.conftest import Serving
 from tests.support.browser import launched
 from tests.support.console.visitor import Visitor
 from tests.support.definitions import container, multinode
 from tests.support.keys import HomeKeys
+from tests.support.waiting import wait_for
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from orchestrator.api.http.access import Access
 from orchestrator.persistence import access_keys
 from orchestrator.persistence.access_keys import Key, KeyStore, KeyUsageError
 from orchestrator.persistence.own_secrets import OwnSecrets
@@ -81,10 +82,11 @@ def test_a_key_has_the_letters_and_digits_of_its_name_as_its_share(
     assert asked or Key.model_validate(older).share == share
 
 
-def test_while_the_database_can_not_be_read_the_keys_stay_and_it_is_logged_once(
+def test_while_the_database_can_not_be_read_the_keys_stay_and_a_damaged_one_is_refused_alone(
     keys: KeyStore, database: Database, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    made = keys.create("a")
+    keys.create("a")
+    keys.create("b")
 
     def fail() -> None:
         raise DatabaseError("database d: gone")
@@ -93,15 +95,22 @@ def test_while_the_database_can_not_be_read_the_keys_stay_and_it_is_logged_once(
         patch.setattr(database, "check", fail)
         for _ in range(3):
             keys.look_again()
-            assert names(keys) == ["a"]
+            assert names(keys) == ["a", "b"]
         with pytest.raises(DatabaseError):
             keys.load()
+    assert caplog.text == ""
+    with database.session() as session:
+        session.connection().exec_driver_sql("UPDATE access_keys SET sealed = 'x' WHERE name = 'b'")
+    for _ in range(3):
+        keys.look_again()
+        assert names(keys) == ["a"]
     assert [record.message for record in caplog.records] == [
-        "database d: gone (until then the 1 keys that were read last stay in force)"
+        "key b is damaged in the database, and is refused: muster keys delete b, and create it again"
     ]
-    assert made.secret not in caplog.text
     keys.delete("a")
-    assert names(keys) == []
+    assert names(keys) == [] and not keys.is_empty and Access(keys).demanded(), "damage opens nothing"
+    keys.delete("b")
+    assert keys.is_empty and not Access(keys).demanded()
 
 
 def test_a_database_is_opened_beside_its_controller_in_the_same_shape_alone(database: Database, tmp_path: Path) -> None:
