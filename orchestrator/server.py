@@ -45,6 +45,7 @@ from orchestrator.persistence.home_files import move_in
 from orchestrator.persistence.models import Job
 from orchestrator.persistence.own_secrets import CONSOLE, OwnSecrets
 from orchestrator.persistence.session import Database, DatabaseError
+from orchestrator.persistence.urls import shown
 from orchestrator.services import arns
 from orchestrator.services.automatic_evaluations import AutomaticEvaluations
 from shared_store.volume.layout import Store
@@ -135,7 +136,7 @@ class Server:
                 move_in(home, own, self.keys)
                 console = bytes.fromhex(own.made(CONSOLE, lambda: token_bytes(32).hex()))
                 self.access = Access(self.keys, token, exposed, exposed, os.geteuid(), console_secret=console)
-                _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access)
+                _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access, database)
                 stack.callback(self.keys.close)
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
@@ -282,11 +283,12 @@ def _name_lost_gangs(home: Path, database: Database) -> None:
         )
 
 
-def _check_exposure(option: str, access: Access) -> None:
+def _check_exposure(option: str, access: Access, database: str | None) -> None:
     """Raises ServerError where others could come in without a key."""
     if access.exposed and not access.token and not access.known():
+        there = f" (with the same --database as here: {shown(database)})" if database else ""
         raise ServerError(
-            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`, or set "
+            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`{there}, or set "
             "MUSTER_TOKEN to a secret, here and for the clients"
         )
 
