@@ -247,7 +247,7 @@ def test_a_share_in_use_is_told_with_its_weight_and_the_host_as_full(console: Co
     assert share["score"] == pytest.approx(share["used"] * 0.5)
     assert told["hosts"][0]["inUse"]["cpus"] == 1.0 and told["queues"][0]["inUse"] == {"cpus": 1.0, "gpus": 0}
     page = console.visitor().page("/queues")
-    assert rows_of(page, "shared/red") and "1 of 1" in page.text
+    assert rows_of(page, "shared/admin") and "1 of 1" in page.text
     console.client.batch("TerminateJob", jobId=running, reason="enough")
     await_status(console.client, running, "FAILED")
 

@@ -19,7 +19,7 @@ from orchestrator.control.bus import Bus, BusError
 from shared_store.contract.bus import LEASE_MILLISECONDS, LONGEST_ANSWER
 from shared_store.contract.node import NodeContract
 from tests.conftest import PATIENCE, REPOSITORY, Serving, wait_for
-from tests.support.faults.outages import partition
+from tests.support.faults.outages import cut, partition
 from tests.support.processes import gang_members, processes_of
 from tests.support.worker.cartpole import raw_iterations, submit, wait_for_iteration
 from tests.support.worker.node import node_contract
@@ -81,10 +81,11 @@ def test_a_frozen_node_is_noticed_by_its_lease_and_welcomed_back(bus: Bus) -> No
     node.wait()
 
 
-def test_a_cut_network_takes_the_controller_s_own_session_away_with_its_only_node(bus: Bus, tmp_path: Path) -> None:
-    node, home = start_node(bus, "time.sleep(600)"), SimpleNamespace(path=tmp_path)
+def test_a_cut_network_takes_the_controller_s_own_session_away_with_its_only_node(bus: Bus) -> None:
+    node = start_node(bus, "time.sleep(600)")
+    assert bus.endpoint is not None
     bus.presence.lost_after = 4.0  # less than from the node's silence to Zenoh's own lease of 10 s
-    with partition(home):
+    with cut(bus.endpoint.rpartition(":")[2]):
         wait_for(lambda: bus.presence.silence(("j", 1, 0), 0.0) is not None, 6, "the silence of the node")
         for _ in range(80):
             silence = bus.presence.silence(("j", 1, 0), 0.0)

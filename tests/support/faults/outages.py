@@ -61,10 +61,14 @@ def loop_volume(directory: Path) -> Iterator[Path]:
         image.unlink()
 
 
-@contextlib.contextmanager
-def partition(home: Home) -> Iterator[None]:
+def partition(home: Home) -> AbstractContextManager[None]:
     """No packet passes between the controller's bus and its nodes."""
-    port = secret_of_home(home.path, BUS_PORT)
+    return cut(secret_of_home(home.path, BUS_PORT))
+
+
+@contextlib.contextmanager
+def cut(port: str | None) -> Iterator[None]:
+    """No packet passes to or from this port of loopback."""
     rules = [(chain, "-i" if chain == "INPUT" else "-o", way) for chain in ("INPUT", "OUTPUT") for way in ("s", "d")]
     for chain, side, way in rules:
         root("iptables", "-I", chain, side, "lo", "-p", "tcp", f"--{way}port", port, "-j", "DROP")
