@@ -203,15 +203,20 @@ def test_the_list_tells_what_each_key_may_do_and_no_secret(console: Console) -> 
 
 
 def test_a_key_is_made_its_secret_is_shown_once_and_it_works(console: Console) -> None:
-    answer = post(console.visitor(), "/keys/create", name="alice", queue=["lab", "default"], read_only="yes")
+    answer = post(
+        console.visitor(), "/keys/create", name="alice", queue=["lab", "default"], read_only="yes", share="team"
+    )
     (key,) = [key for key in console.keys.load().values() if key.name == "alice"]
-    assert (key.queues, key.read_only) == (("lab", "default"), True)
+    assert (key.queues, key.read_only, key.share) == (("lab", "default"), True, "team")
     assert answer.status_code == 200 and f"MUSTER_TOKEN={secret_of(key)}" in answer.text
     assert answer.headers["cache-control"] == "no-store"
     alice = Visitor(console.url, secret_of(key))
     assert "key alice" in alice.page("/").text
     alice.close()
-    assert key.secret not in console.visitor().page("/keys").source
+    page = console.visitor().page("/keys")
+    assert key.secret not in page.source and "read only team" in page.text
+    wrong = post(console.visitor(), "/keys/create", name="carol", share="a-b")
+    assert wrong.status_code == 400 and "--share 'a-b': 1 to 255 letters and digits" in Page(wrong.text).text
     again = post(console.visitor(), "/keys/create", name="alice")
     assert again.status_code == 400 and "there is a key alice already" in Page(again.text).text
 
