@@ -183,7 +183,7 @@ def controller(
         with database.session() as session:
             ensure_compute_environments(session, engines.names)
         peers = Peers(store, home)
-        bus = Bus(home)
+        bus = Bus(home, {})
         if isinstance(engine, LocalEngine):
             bus.open()
             stack.callback(bus.close)

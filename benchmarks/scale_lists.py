@@ -29,7 +29,6 @@ from orchestrator.console import jobs as jobs_page
 from orchestrator.console import live
 from orchestrator.console.live import Recent
 from orchestrator.domain.job import Status
-from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import Attempt, Job, JobDefinition, JobQueue, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
@@ -37,6 +36,7 @@ from orchestrator.services.arns import definition_arn
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.file import load
 from tests.support.console.fixtures import secret_of
+from tests.support.keys import HomeKeys
 
 REQUESTS = 300
 QUEUES = ("default", "lab", "night", "robots", "students")
@@ -216,7 +216,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, is_kept[0], is_kept[1]:
         home = Path(folder)
         fill(home, options.jobs)
-        keys = KeyStore(home)
+        keys = HomeKeys(home)
         secrets = {key.name: secret_of(key) for key in (keys.create("admin"), keys.create("lab", ("lab", "night")))}
         began, used = time.monotonic(), time.process_time()
         server = Server(home, cpus=1, rate_limit=0, adopt_store=True)

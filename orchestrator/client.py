@@ -60,6 +60,8 @@ class Client:
         if not _is_url(url):
             raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {EXAMPLE_URL}")
         self.url = url
+        self.has_key = bool(re.match("[A-Z0-9]{16,128}:", token or ""))
+        """Whether it sends a key, whose share its jobs have in a queue with a fair-share policy."""
         self.found = False
         """Whether it is the running controller of the home directory, which no URL named."""
         self.is_temporary = False

@@ -7,19 +7,17 @@ import json
 import logging
 import os
 import re
-import secrets
 import time
 from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
 from orchestrator.domain.errors import ServerError
-from shared_store.volume.files import write_atomic
 
 _OURS = re.compile(
-    r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?console\..*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
+    r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?console\..*|\.?sealing\..*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
 )
-"""Names in the home directory: database, keys, bus, the engines' directories, and what a volume has of itself."""
+"""Names in the home directory: database, sealing key, bus, what older Musters had there, the engines' directories, and what a volume has of itself."""
 
 _DIRECTORIES = ("store", "supervisors", "kernels", "ray")
 """Of these, the directories: of runs, and of what engines and jobs keep."""
@@ -53,28 +51,19 @@ def local_region() -> str:
     return str((_published(muster_home()) or {}).get("region") or "us-east-1")
 
 
+def local_database(home: Path) -> str | None:
+    """The database of the controller of a home directory, without a password; None where it does not run."""
+    return (_published(home) or {}).get("database")
+
+
 def _published(home: Path) -> dict[str, Any] | None:
     """What the controller of a home directory tells of itself; None where it does not run, or not yet."""
     try:
         found = json.loads((home / "controller.json").read_text())
         os.kill(int(found["pid"]), 0)
-        return {"url": found["url"], "temporary": found.get("temporary"), "region": found.get("region")}
+        return {"url": found["url"], **{name: found.get(name) for name in ("temporary", "region", "database")}}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
-
-
-def console_secret(home: Path) -> bytes:
-    """The key that signs the console's sessions: the home directory's own, made where there is none. A new one each time where it can't be kept."""
-    path = home / "console.secret"
-    with suppress(OSError):
-        if len(kept := path.read_bytes()) == 32:
-            return kept
-    made = secrets.token_bytes(32)
-    try:
-        write_atomic(path, made, mode=0o600)
-    except OSError as error:
-        log.warning("%s can't be written (%s): the next start ends the console's sessions", path, error.strerror)
-    return made
 
 
 def make_private(home: Path) -> None:
@@ -151,11 +140,11 @@ class HomeLock:
             return False
         return True
 
-    def publish(self, url: str, temporary: bool, region: str) -> None:
-        """Tell commands on this machine where the controller listens, whether it goes away with the command that started it, and its AWS
-        region.
+    def publish(self, url: str, temporary: bool, region: str, database: str) -> None:
+        """Tell commands on this machine where the controller listens, whether it goes away with the command that started it, its AWS
+        region, and its database (without a password).
         """
-        told = {"pid": os.getpid(), "url": url, "temporary": temporary, "region": region}
+        told = {"pid": os.getpid(), "url": url, "temporary": temporary, "region": region, "database": database}
         try:
             self.path.write_text(json.dumps(told))
         except OSError as error:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
+from secrets import token_bytes
 from typing import Any, cast
 
 import uvicorn
@@ -31,17 +32,20 @@ from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
 from orchestrator.control.presence import LOST_AFTER, Presence
 from orchestrator.control.store_identity import recognise
-from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks
+from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks, settle_webhooks
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.engines.api import EngineError, Setting
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.gangs import running_gangs
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.secrets import Secrets, SecretsError
-from orchestrator.home import HomeLock, console_secret
-from orchestrator.keys import KeyStore
+from orchestrator.home import HomeLock
+from orchestrator.persistence.access_keys import KeyStore
+from orchestrator.persistence.home_files import move_in
 from orchestrator.persistence.models import Job
+from orchestrator.persistence.own_secrets import CONSOLE, OwnSecrets
 from orchestrator.persistence.session import Database, DatabaseError
+from orchestrator.persistence.urls import shown
 from orchestrator.plugins import add_plugins
 from orchestrator.services import arns
 from orchestrator.services.automatic_evaluations import AutomaticEvaluations
@@ -100,7 +104,8 @@ class Server:
         ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
         ``squeue_interval``: seconds between two calls of ``squeue``; None: as the slurm engine chooses.
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
-        ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.control.webhooks.read_webhooks`).
+        ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.control.webhooks.read_webhooks`); None:
+        those of the database. A ``temporary`` controller has none.
         ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
 
         Raises:
@@ -109,14 +114,11 @@ class Server:
         self._temporary = temporary
         _check_token(token)
         _check_proxies(trusted_proxies)
-        told = _read_webhooks(webhooks)
+        given = _read_webhooks(webhooks)
         exposed = not is_loopback(host) or bool(trusted_proxies)
-        self.access = Access(KeyStore(home), token, exposed=exposed, reachable=exposed, user=os.geteuid())
-        _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access)
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
             self._lock = _take_lock(home, temporary)
             stack.callback(self._lock.release)
-            self.access.console_secret = console_secret(home)
             self._socket = _listen(host, port)
             stack.callback(self._socket.close)
             nodes = _make_engines(
@@ -128,8 +130,15 @@ class Server:
             self.store = Store(store or home / "store")
             self.store.check_writable()
             try:
-                found = Database(_database_url(database)) if database else Database.at(home)
+                found = Database.at(home, database)
                 stack.callback(found.close)
+                own = OwnSecrets(found, home)
+                self.keys = KeyStore(own)
+                move_in(home, own, self.keys)
+                console = bytes.fromhex(own.made(CONSOLE, lambda: token_bytes(32).hex()))
+                self.access = Access(self.keys, token, exposed, exposed, os.geteuid(), console_secret=console)
+                _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access, database)
+                stack.callback(self.keys.close)
                 nodes.secrets = Secrets(secrets)
                 with found.session() as session:
                     arns.settle(recognise_account(session, account, region, temporary))
@@ -138,9 +147,10 @@ class Server:
                     ensure_compute_environments(session, nodes.names)
                 if any(engine.traits.as_owner for engine in nodes.engines.values()):
                     self.store.check_owner()
-            except (DatabaseError, SecretsError) as error:
+                told = () if temporary else settle_webhooks(own, given)
+            except (DatabaseError, SecretsError, WebhooksError) as error:
                 raise ServerError(str(error)) from None
-            self.bus = Bus(home, nodes.addresses, Presence(lost_after))
+            self.bus = Bus(home, own, nodes.addresses, Presence(lost_after))
             stack.callback(self.bus.close)
             self.peers = Peers(self.store, home, identity.check)
             stack.callback(self.peers.close)
@@ -194,13 +204,14 @@ class Server:
     def start(self) -> None:
         """Start the controller and the server, and tell commands on this machine where it is."""
         self.bus.open()
+        self.keys.start()
         self.peers.start()
         self.controller.start()
         self.controller.retention.start(self.controller.access.calls.later)
         self.evaluations.start()
         self.deliveries.start()
         self._thread.start()
-        self._lock.publish(self.url, self._temporary, arns.here().region)
+        self._lock.publish(self.url, self._temporary, arns.here().region, self.controller.database.shown)
 
     def close(self) -> None:
         """Stop serving; running gangs continue, and the next controller of this home finds them."""
@@ -229,13 +240,9 @@ def _default_store(path: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def _database_url(text: str) -> str:
-    return text if "://" in text else f"sqlite:///{Path(text).expanduser().absolute()}"
-
-
-def _read_webhooks(source: str | None) -> Sequence[Webhook]:
+def _read_webhooks(source: str | None) -> Sequence[Webhook] | None:
     try:
-        return read_webhooks(source)
+        return None if source is None else read_webhooks(source)
     except WebhooksError as error:
         raise ServerError(str(error)) from None
 
@@ -278,12 +285,12 @@ def _name_lost_gangs(home: Path, database: Database) -> None:
         )
 
 
-def _check_exposure(option: str, access: Access) -> None:
-    """Raises ServerError where others could come in without a key, or the keys can't be read."""
-    keys = access.keys.load() if access.keys else {}
-    if access.exposed and not access.token and not keys:
+def _check_exposure(option: str, access: Access, database: str | None) -> None:
+    """Raises ServerError where others could come in without a key."""
+    if access.exposed and not access.token and not access.known():
+        there = f" (with the same --database as here: {shown(database)})" if database else ""
         raise ServerError(
-            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`, or set "
+            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`{there}, or set "
             "MUSTER_TOKEN to a secret, here and for the clients"
         )
 

@@ -2,20 +2,38 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.table import Table
+from sqlalchemy import make_url
+from sqlalchemy.exc import ArgumentError
 
 from orchestrator.cli.jobs import JsonOption
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json, print_rows
 from orchestrator.client import EXAMPLE_URL
-from orchestrator.home import local_region, local_url, muster_home
-from orchestrator.keys import KeyStore
+from orchestrator.domain.errors import ServerError, Unavailable, UsageError
+from orchestrator.home import ControllerRuns, HomeLock, local_database, local_region, local_url, muster_home
+from orchestrator.persistence.access_keys import KeyStore
+from orchestrator.persistence.home_files import move_in
+from orchestrator.persistence.own_secrets import OwnSecrets
+from orchestrator.persistence.session import Database, DatabaseTaken
+from orchestrator.persistence.urls import database_url, shown
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the key: its user or program.")]
+DatabaseOption = Annotated[
+    str | None,
+    typer.Option(
+        envvar="MUSTER_DATABASE",
+        help="The controller's database, as `muster serve` has it; $MUSTER_HOME/muster.db by default.",
+        show_default=False,
+    ),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -35,16 +53,26 @@ def create(
         list[str] | None, typer.Option(help="A job queue that the key may use; repeatable. All queues by default.")
     ] = None,
     read_only: Annotated[bool, typer.Option("--read-only", help="The key may read but change nothing.")] = False,
+    share: Annotated[
+        str | None,
+        typer.Option(
+            help="Share identifier of its jobs in queues with a fair-share policy; several keys may have one. By default the letters and "
+            "digits of its name.",
+            show_default=False,
+        ),
+    ] = None,
+    database: DatabaseOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Create a key and show it once. From now on the server admits only callers with a key or MUSTER_TOKEN."""
-    key = KeyStore(muster_home()).create(name, tuple(queue or ()), read_only)
+    with opened(muster_home(), database) as keys:
+        key = keys.create(name, queue, read_only, share)
     if as_json:
         echo_json({**key.describe(), "secretAccessKey": key.secret})
         return
     url = local_url() or EXAMPLE_URL
     echo(
-        f"""created key {key.name} ({key.rights}); its secret is shown only this once
+        f"""created key {key.name} ({key.rights}, share {key.share}); its secret is shown only this once
 
 AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(profile_name="{key.name}")):
   aws configure set aws_access_key_id {key.access_key_id} --profile {key.name}
@@ -55,13 +83,14 @@ AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(prof
 muster, and 'Authorization: Bearer …' elsewhere:
   export MUSTER_TOKEN={key.access_key_id}:{key.secret}
 
-The server of {muster_home()} demands a key from now on; it needs no restart."""
+The server of {muster_home()} demands a key from now on; a running one sees this one within a second."""
     )
 
 
-def list_keys(as_json: JsonOption = False) -> None:
+def list_keys(database: DatabaseOption = None, as_json: JsonOption = False) -> None:
     """List the keys, without their secrets."""
-    keys = KeyStore(muster_home()).load().values()
+    with opened(muster_home(), database) as there:
+        keys = there.current().values()
     if as_json:
         echo_json([key.describe() for key in keys], indent=1)
         return
@@ -69,23 +98,63 @@ def list_keys(as_json: JsonOption = False) -> None:
         echo("no keys yet; create one with: muster keys create NAME")
         return
     table = Table(box=None, pad_edge=False)
-    for column in ("NAME", "ACCESS KEY ID", "MAY", "CREATED"):
+    for column in ("NAME", "ACCESS KEY ID", "MAY", "SHARE", "CREATED"):
         table.add_column(column, no_wrap=column != "MAY")
     for key in keys:
         created = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(key.created_at / 1000))
-        table.add_row(key.name, key.access_key_id, key.rights, created)
+        table.add_row(key.name, key.access_key_id, key.rights, key.share, created)
     print_rows(table)
 
 
-def delete(name: NameArgument) -> None:
-    """Delete a key: a running server refuses its next request. After the last key, print who can still connect."""
-    keys = KeyStore(muster_home())
-    keys.delete(name)
+def delete(name: NameArgument, database: DatabaseOption = None) -> None:
+    """Delete a key: a running server refuses it within a second. After the last key, print who can still connect."""
+    with opened(muster_home(), database) as keys:
+        keys.delete(name)
+        left = keys.current()
     echo(f"deleted key {name}")
-    if not keys.load():
+    if not left:
         echo(
             f"""this was the last key of {muster_home()}:
   a running server admits only callers with its MUSTER_TOKEN, until a new key exists or it is restarted
   a server started from now on accepts its own user's requests on loopback without a key
   a server that other machines can reach (--host) does not start without a key or MUSTER_TOKEN"""
+        )
+
+
+@contextlib.contextmanager
+def opened(home: Path, database: str | None = None) -> Iterator[KeyStore]:
+    """The keys of a home directory's database, whether a controller runs on it or not.
+
+    Where none does, this is the first start: the database and the sealing key are made, and the files of an older Muster moved in. The lock
+    makes a controller that starts meanwhile wait.
+
+    Raises ServerError.
+    """
+    with contextlib.ExitStack() as stack:
+        try:
+            try:
+                stack.callback(HomeLock(home, temporary=True).release)
+                found = Database.at(home, database)
+            except (ControllerRuns, DatabaseTaken):
+                _check_same(home, database)
+                found = Database.at(home, database, beside=True)
+            stack.callback(found.close)
+            own = OwnSecrets(found, home)
+            keys = KeyStore(own)
+            move_in(home, own, keys)
+            yield keys
+        except (Unavailable, ArgumentError) as error:
+            raise ServerError(str(error)) from None
+        except OSError as error:
+            raise ServerError(
+                f"{home}: can't be used ({error.strerror}); set MUSTER_HOME to a directory that can be written"
+            ) from None
+
+
+def _check_same(home: Path, database: str | None) -> None:
+    """Raises UsageError where the controller that runs on this home directory has another database."""
+    running = local_database(home)
+    if running is not None and running != shown(str(make_url(database_url(home, database)))):
+        raise UsageError(
+            f"the controller of {home} has its keys in {running}: give that with --database, or as MUSTER_DATABASE"
         )

@@ -187,7 +187,8 @@ def serve(
     webhooks: Annotated[
         str | None,
         typer.Option(
-            help="Send a message when jobs end: a JSON file of URLs and secrets; see `muster webhooks --help`."
+            help="Send a message when jobs end: a JSON file of URLs and secrets, which replace those of the database; see `muster "
+            "webhooks --help`. By default the database's."
         ),
     ] = None,
     account_id: Annotated[

@@ -17,7 +17,8 @@ from shared_store.contract.error_text import counted
 def register(app: typer.Typer) -> None:
     group = make_group(
         "List and test the controller's webhooks, which report the end of jobs.\n\nConfigure them with `muster serve --webhooks FILE`, a JSON "
-        'object by name: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}.',
+        'object by name: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}. The database keeps them, '
+        "sealed, for later starts; another file replaces them.",
         "Examples:  muster webhooks test chat   then   muster webhooks list",
     )
     group.command("list", epilog="Example:  muster webhooks list --json | jq '.[].failed'")(list_webhooks)

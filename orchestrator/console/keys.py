@@ -18,7 +18,7 @@ from orchestrator.services.context import queue_names
 
 router = page_router()
 _INTERVAL = 1.0
-"""Seconds between two looks at the file of the keys."""
+"""Seconds between two looks at the keys."""
 
 
 @router.get("/keys")
@@ -28,7 +28,7 @@ def keys(request: Request) -> Response:
     rows = _rows(request)
     with controller_of(request).database.session() as session:
         queues = queue_names(session, actor)
-    blank = dict.fromkeys(("name", "id", "rights", "created", "own"), "")
+    blank = dict.fromkeys(("name", "id", "rights", "share", "created", "own"), "")
     return render(
         request, "keys.html", rows=list(rows.values()), blank=blank, queues=queues, writable=is_writable(request)
     )
@@ -54,6 +54,7 @@ def _rows(request: Request) -> dict[str, dict[str, str]]:
             "name": key.name,
             "id": key.access_key_id,
             "rights": key.rights,
+            "share": key.share,
             "created": words.moment(key.created_at),
             "own": "you" if own == f"key {key.name}" else "",
         }
@@ -68,7 +69,8 @@ def create(request: Request, form: Form = Depends(sent_form)) -> Response:
     if not list_keys(request):
         text = "From now on everybody needs a key, you too: copy its secret from the next page, and log in with it."
         form.confirm(Question(f"Make the first key, {name}?", text, "Make it"))
-    key = create_key(request, name, tuple(form.every("queue")), form.one("read_only") == "yes")
+    share = form.one("share").strip() or None
+    key = create_key(request, name, tuple(form.every("queue")), form.one("read_only") == "yes", share)
     return render(request, "key.html", key=key, url=str(request.base_url).rstrip("/"), region=here().region)
 
 

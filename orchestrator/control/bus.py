@@ -21,9 +21,11 @@ import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from orchestrator.control.presence import Presence
+from orchestrator.domain.errors import Unavailable
+from orchestrator.persistence.own_secrets import BUS_KEY, BUS_PORT
 from shared_store.contract.bus import (
     LARGEST_MESSAGE,
     LARGEST_PROGRESS,
@@ -39,7 +41,7 @@ from shared_store.contract.bus import (
     presence_key,
     push_proof,
 )
-from shared_store.volume.files import DamagedFile, json_object, read_json, write_atomic, write_json
+from shared_store.volume.files import DamagedFile, json_object, write_atomic
 
 log = logging.getLogger("muster.bus")
 
@@ -104,16 +106,30 @@ class BusError(Exception):
     """A command got no answer; the message says why."""
 
 
+class Kept(Protocol):
+    """Where port and master key of the bus are kept: :class:`orchestrator.persistence.own_secrets.OwnSecrets`, or a dictionary."""
+
+    def get(self, name: str, /) -> str | None: ...
+
+    def __setitem__(self, name: str, text: str, /) -> None: ...
+
+
 class Bus:
     """A Zenoh router with a password, on loopback and where nodes on other machines (or in containers) see this one.
 
-    Its port and master key stay the same for a home directory.
+    Its port and master key stay the same for a database.
 
     They must: nodes that outlive a controller look for its successor where they found it.
     """
 
-    def __init__(self, home: Path, addresses: Sequence[str] = (), presence: Presence | None = None) -> None:
-        """``addresses``: addresses of this machine on which the router listens beside loopback."""
+    def __init__(self, home: Path, kept: Kept, addresses: Sequence[str] = (), presence: Presence | None = None) -> None:
+        """
+        Args:
+            home: The home directory, for the file in which Zenoh reads the router's password.
+            kept: Has port and master key.
+            addresses: Addresses of this machine on which the router listens beside loopback.
+            presence: Which nodes are connected.
+        """
         self.presence = presence or Presence()
         """Which nodes are connected."""
         self.changed: Callable[[str], None] = lambda _: None
@@ -124,7 +140,7 @@ class Bus:
         """Called (on the network's thread) with the end of a node's log (None: it does not push it), and whether nothing follows."""
         self.is_followed: Callable[[str], bool] = lambda _: False
         """Whether somebody follows the logs of this job: pushes of others are dropped unread."""
-        self._home, self._addresses = home, addresses
+        self._home, self._kept, self._addresses = home, kept, addresses
         self._lock = threading.Lock()
         self._progress: dict[Node, dict[str, Any]] = {}
         self._session: Any = None
@@ -135,27 +151,30 @@ class Bus:
         self.endpoint: str | None = None
 
     def open(self) -> None:
-        """Start the router. Where that fails, the bus is off: a log line says so, and everything else works as usual."""
+        """Start the router. Where that fails, the bus is off: a log line says so, and everything else works as usual.
+
+        Raises SealError where the master key can't be opened.
+        """
         if os.environ.get("MUSTER_BUS_OFF"):
             return
         try:
-            kept = read_json(self._home / "bus.json") or {}
-        except ValueError:
-            log.warning(
-                "%s is damaged: the bus starts with a new key, which running nodes do not have", self._home / "bus.json"
-            )
-            kept = {}
-        self._master = str(kept.get("key") or secrets.token_hex(32))
-        try:
-            for port in (kept.get("port"), _free_port()):
-                if isinstance(port, int) and self._try(port):
+            found = self._kept.get(BUS_KEY)
+            self._master = found or secrets.token_hex(32)
+            if found is None:
+                self._kept[BUS_KEY] = self._master
+            before = int(self._kept.get(BUS_PORT) or 0)
+            for port in (before, _free_port()):
+                if port and self._try(port):
                     self.endpoint = f"tcp/127.0.0.1:{port}"
-                    if (facts := {"port": port, "key": self._master}) != kept:
-                        write_json(self._home / "bus.json", facts, mode=0o600)
+                    if port != before:
+                        self._kept[BUS_PORT] = str(port)
                     return
             trouble = "no router could be started"
         except OSError as error:  # the volume is full, say; what runs can be stopped all the same
             trouble = f"{self._home} can't be written ({error.strerror})"
+            self.close()
+        except Unavailable as error:
+            trouble = str(error)
             self.close()
         log.warning("the bus is off: %s; jobs run, commands to them do not", trouble)
 

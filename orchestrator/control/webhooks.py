@@ -1,7 +1,7 @@
 """Webhooks: the receivers of messages about ended jobs, and the signature of a message.
 
-They are those of a file that the operator gives at the start, and no others: a URL in a user's YAML would let any user make the
-controller connect to what only the controller can reach. Signatures follow Standard Webhooks (standardwebhooks.com).
+They are those of the file that the operator gave at a start last, and no others: a URL in a user's YAML would let any user make the
+controller connect to what only the controller can reach. The database keeps them, sealed, for the starts without a file. Signatures follow Standard Webhooks (standardwebhooks.com).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, 
 
 from orchestrator.domain.job import Status
 from orchestrator.persistence.models import Job
+from orchestrator.persistence.own_secrets import WEBHOOKS, OwnSecrets
 from orchestrator.spec.model import KINDS
 from shared_store.contract.error_text import explain, path_of
 from shared_store.volume.layout import NAME
@@ -32,7 +33,7 @@ _SECRET_SIZES = range(24, 65)
 
 
 class WebhooksError(Exception):
-    """The file can't be used; one line without any secret: which key, why, and what to do."""
+    """The webhooks can't be used; one line without any secret: which key, why, and what to do."""
 
 
 def _url(value: str) -> str:
@@ -129,10 +130,8 @@ def _spec(job: Job) -> Mapping[str, Any]:
         return {}
 
 
-def read_webhooks(source: str | None) -> Sequence[Webhook]:
-    """The webhooks of a JSON file, ``{"NAME": {"url": …, "secret": "whsec_…"}}``; none without a file. Raises WebhooksError."""
-    if source is None:
-        return ()
+def read_webhooks(source: str) -> Sequence[Webhook]:
+    """The webhooks of a JSON file, ``{"NAME": {"url": …, "secret": "whsec_…"}}``. Raises WebhooksError."""
     path = Path(source).expanduser()
     try:
         if path.stat().st_mode & 0o077:
@@ -141,18 +140,39 @@ def read_webhooks(source: str | None) -> Sequence[Webhook]:
     except (OSError, ValueError, RecursionError) as error:
         problem = error.strerror if isinstance(error, OSError) else "not JSON"
         raise WebhooksError(f"{path}: webhooks can't be read ({problem})") from None
-    if not isinstance(found, dict) or not found:
-        raise WebhooksError(f'{path}: expected a JSON object, {{"NAME": {{"url": "https://…", "secret": "whsec_…"}}}}')
+    return _webhooks(found, str(path))
+
+
+def settle_webhooks(own: OwnSecrets, given: Sequence[Webhook] | None) -> Sequence[Webhook]:
+    """The webhooks from now on: those that are ``given``, which replace the database's; where None, the database's.
+
+    Raises WebhooksError, SealError, DatabaseError.
+    """
+    if given is not None:
+        own[WEBHOOKS] = json.dumps({each.name: each.model_dump(mode="json", exclude={"name"}) for each in given})
+        return given
+    kept = own.get(WEBHOOKS)
+    return (
+        _webhooks(json.loads(kept), "the database's webhooks (muster serve --webhooks FILE replaces them)")
+        if kept
+        else ()
+    )
+
+
+def _webhooks(found: Any, where: str) -> Sequence[Webhook]:
+    """The webhooks of a document that comes from ``where``. Raises WebhooksError."""
+    if not isinstance(found, dict):
+        raise WebhooksError(f'{where}: expected a JSON object, {{"NAME": {{"url": "https://…", "secret": "whsec_…"}}}}')
     for name in found:
         if not NAME.fullmatch(name) or "name" in (found[name] if isinstance(found[name], dict) else {}):
-            raise WebhooksError(f"{path}: {name[:60]!r} is no name of a webhook: letters, digits, '.', '_' and '-'")
+            raise WebhooksError(f"{where}: {name[:60]!r} is no name of a webhook: letters, digits, '.', '_' and '-'")
     try:
         read = TypeAdapter(dict[str, Webhook]).validate_python(found)
     except ValidationError as error:
         first: Any = error.errors(include_url=False)[0]
-        where = ".".join(str(part) for part in path_of(first))
+        key = ".".join(str(part) for part in path_of(first))
         words = f"unknown key; valid here: {', '.join(_KEYS)}" if first["type"] == "extra_forbidden" else _told(first)
-        raise WebhooksError(f"{path}: {where}: {words}") from None
+        raise WebhooksError(f"{where}: {key}: {words}") from None
     return [webhook.model_copy(update={"name": name}) for name, webhook in read.items()]
 
 

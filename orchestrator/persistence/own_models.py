@@ -1,4 +1,7 @@
-"""The tables of what a controller is and keeps: its clock, store, account, texts, messages, log groups, uses of runs and queues. Jobs are in :mod:`.models`."""
+"""The models of what a controller is and keeps: its clock, store, account, keys, secrets, texts, messages, log groups, uses of runs and queues.
+
+Jobs are in :mod:`.models`.
+"""
 
 from __future__ import annotations
 
@@ -83,6 +86,28 @@ class KnownAccount(Base):
     id: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)
     account: Mapped[str]
     region: Mapped[str]
+
+
+class SealedSecret(Base):
+    """A secret of the controller (:mod:`orchestrator.persistence.own_secrets`)."""
+
+    __tablename__ = "sealed_secrets"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    sealed: Mapped[str]
+
+
+class AccessKey(Base):
+    """A key of a caller (:mod:`orchestrator.persistence.access_keys`); a row never changes."""
+
+    __tablename__ = "access_keys"
+    name: Mapped[str] = mapped_column(primary_key=True)
+    access_key_id: Mapped[str] = mapped_column(unique=True)
+    sealed: Mapped[str]
+    """Its secret."""
+    queues: Mapped[list[str] | None]
+    read_only: Mapped[bool]
+    share: Mapped[str]
+    created_at: Mapped[int]
 
 
 class LogGroup(Base):

@@ -21,16 +21,20 @@ class NewerSchema(Exception):
     """The database has a revision that this Muster does not know; the message is its name."""
 
 
+def schema_of(connection: Connection) -> str | None:
+    """The revision of the database; None before it has one."""
+    return connection.scalar(select(_VERSION.c.version_num)) if inspect(connection).has_table(_VERSION.name) else None
+
+
 def bring_up_to_date(connection: Connection) -> None:
     """Create the tables, or migrate existing ones. Raises NewerSchema.
 
     Alembic is imported only where there is something to migrate: it takes as long as half of the rest of a start.
     """
-    tables = inspect(connection).get_table_names()
-    present = connection.scalar(select(_VERSION.c.version_num)) if _VERSION.name in tables else None
+    present = schema_of(connection)
     if present == NEWEST:
         return
-    if present is None and "jobs" not in tables:
+    if present is None and not inspect(connection).has_table("jobs"):
         if connection.dialect.name == "sqlite":  # Python's driver begins no transaction for CREATE TABLE
             connection.exec_driver_sql("BEGIN IMMEDIATE")
         Base.metadata.create_all(connection)

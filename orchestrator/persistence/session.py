@@ -30,8 +30,9 @@ from sqlalchemy.orm import ORMExecuteState, Session
 from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.job_counts import JobCounts, note_counts
 from orchestrator.persistence.models import Attempt, Job, Node
-from orchestrator.persistence.schema import NewerSchema, bring_up_to_date
+from orchestrator.persistence.schema import NEWEST, NewerSchema, bring_up_to_date, schema_of
 from orchestrator.persistence.updates import write_changes
+from orchestrator.persistence.urls import connect_args, database_url, is_in_memory, shown
 
 _RESERVE = 5 << 20
 """Bytes; SQLite's write-ahead log has 4 MiB when it is copied into the file."""
@@ -48,6 +49,10 @@ class DatabaseError(Unavailable):
     """The database can't be used; the message says why and what to do."""
 
 
+class DatabaseTaken(DatabaseError):
+    """Another controller has the database."""
+
+
 class DatabaseFull(DatabaseError):
     """The volume of the database has no room for additions; the ends of jobs are still written."""
 
@@ -58,12 +63,16 @@ class Database:
     _own: tuple[int, Engine] | None = None
     """A thread that has connections for itself alone, and the engine that makes them."""
 
-    def __init__(self, url: str) -> None:
+    def __init__(self, url: str, *, beside: bool = False) -> None:
         """Open ``url`` (``sqlite:///path``, ``postgresql+psycopg://…``) and bring its tables up to date.
 
+        ``beside``: another process, which may be a controller, has it already: this one takes no lock and changes no table's shape.
+
         Raises:
-            DatabaseError: It can't be reached, is of a newer Muster, or another controller has it.
+            DatabaseTaken: Another controller has it.
+            DatabaseError: It can't be reached, is of another Muster's shape, or is not there yet.
         """
+        self.is_beside = beside
         self.committed: Callable[[Sequence[Job]], None] | None = None
         self.changed: Callable[[Collection[str]], None] | None = None
         """Called with the ids of jobs that a commit has changed without loading them (:func:`note_changed`)."""
@@ -81,29 +90,33 @@ class Database:
         try:
             self.engine = self._new_engine(url)
         except (SQLAlchemyError, ModuleNotFoundError) as error:
-            raise DatabaseError(_explain(_shown(url), error)) from None
+            raise DatabaseError(_explain(shown(url), error)) from None
         try:
             self._open()
         except BaseException as error:
             self.close()
             if isinstance(error, SQLAlchemyError):
-                raise DatabaseError(_explain(_shown(url), error)) from None
+                raise DatabaseError(_explain(shown(url), error)) from None
             raise
 
     def _open(self) -> None:
         """Take the lock, then migrate: nothing of a database that another controller has is touched."""
-        if self.engine.dialect.name == "sqlite":
-            if (path := self.engine.url.database) not in (None, "", ":memory:"):
-                self._file = Path(str(path))
-                self._file_lock = self._take_file_lock(self._file)
-                _make_private(self._file)
-        else:
+        if self.engine.dialect.name == "sqlite" and not is_in_memory(self.engine.url):
+            self._file = Path(str(self.engine.url.database))
+        if self.is_beside:
+            self._check_shape()
+        elif self._file is not None:
+            self._file_lock = self._take_file_lock(self._file)
+            _make_private(self._file)
+        elif self.engine.dialect.name != "sqlite":
             self._lock = self._take_lock()
-        self._migrate()
+        if not self.is_beside:
+            self._migrate()
         if self._file is not None:
             found = self._file.stat()
             self._identity = found.st_dev, found.st_ino
-            self._reserve()
+            if not self.is_beside:
+                self._reserve()
 
     def _new_engine(self, url: str | URL) -> Engine:
         parsed = make_url(url)
@@ -111,9 +124,9 @@ class Database:
         engine = create_engine(
             parsed,
             pool_pre_ping=not is_sqlite,
-            connect_args=_connect_args(parsed),
+            connect_args=connect_args(parsed),
             json_deserializer=_read_document,
-            **({} if _is_in_memory(parsed) else {"pool_timeout": _POOL_TIMEOUT}),
+            **({} if is_in_memory(parsed) else {"pool_timeout": _POOL_TIMEOUT}),
         )
         if is_sqlite:
             event.listen(engine, "do_connect", self._check_before_connect)
@@ -122,13 +135,13 @@ class Database:
 
     def reserve_connections(self) -> None:
         """Give this thread connections for itself, which no other can take. A database in memory has only one."""
-        if (self._own is None or self._own[0] != threading.get_ident()) and not _is_in_memory(self.engine.url):
+        if (self._own is None or self._own[0] != threading.get_ident()) and not is_in_memory(self.engine.url):
             self._own = threading.get_ident(), self._new_engine(self.engine.url)
 
     @classmethod
-    def at(cls, home: Path) -> Database:
-        """The SQLite database of a Muster home directory."""
-        return cls(f"sqlite:///{home / 'muster.db'}")
+    def at(cls, home: Path, other: str | None = None, *, beside: bool = False) -> Database:
+        """The database of a Muster home directory: its SQLite file, or the ``other`` that its controller is given, a URL or a path."""
+        return cls(database_url(home, other), beside=beside)
 
     @contextmanager
     def session(self) -> Iterator[Session]:
@@ -154,16 +167,16 @@ class Database:
             session.commit()
         except PoolTimeout as error:
             raise DatabaseError(
-                f"database {self._shown}: all connections of this controller are busy; try again in a moment"
+                f"database {self.shown}: all connections of this controller are busy; try again in a moment"
             ) from error
         except DBAPIError as error:
             if _is_damaged(error):
-                self._damage = _explain(self._shown, error)
+                self._damage = _explain(self.shown, error)
             elif not isinstance(error, OperationalError | InterfaceError):
                 raise
             elif _is_full(error):
-                raise DatabaseFull(f"database {self._shown}: its volume is full; make room there") from error
-            raise DatabaseError(_explain(self._shown, error)) from error
+                raise DatabaseFull(f"database {self.shown}: its volume is full; make room there") from error
+            raise DatabaseError(_explain(self.shown, error)) from error
 
     @property
     def volume(self) -> Path | None:
@@ -207,11 +220,12 @@ class Database:
             try:
                 self._lock = self._take_lock()
             except SQLAlchemyError as error:
-                raise DatabaseError(f"database {self._shown}: {_first_line(error)}") from error
+                raise DatabaseError(f"database {self.shown}: {_first_line(error)}") from error
 
     @property
-    def _shown(self) -> str:
-        return _shown(str(self.engine.url))
+    def shown(self) -> str:
+        """Its URL, without the password."""
+        return shown(str(self.engine.url))
 
     def _check_before_connect(self, *_: object) -> None:
         """SQLite would make a new, empty file in place of one that was deleted."""
@@ -233,7 +247,7 @@ class Database:
         except OperationalError as error:
             if not _is_full(error):
                 raise
-            log.warning("database %s: its volume is nearly full; make room there", self._shown)
+            log.warning("database %s: its volume is nearly full; make room there", self.shown)
 
     def close(self) -> None:
         if self._lock is not None:
@@ -264,11 +278,22 @@ class Database:
             file.close()
             if isinstance(error, BlockingIOError):
                 raise self._taken() from None
-            raise DatabaseError(f"database {self._shown}: {file.name} can't be locked ({error.strerror})") from None
+            raise DatabaseError(f"database {self.shown}: {file.name} can't be locked ({error.strerror})") from None
         return file
 
-    def _taken(self) -> DatabaseError:
-        return DatabaseError(f"database {self._shown}: another controller has it; use that one, or stop it first")
+    def _taken(self) -> DatabaseTaken:
+        return DatabaseTaken(f"database {self.shown}: another controller has it; use that one, or stop it first")
+
+    def _check_shape(self) -> None:
+        """Raises DatabaseError unless a controller of this Muster's schema has made the tables."""
+        if self._file is not None and not self._file.exists():
+            raise DatabaseError(f"database {self.shown} is not there yet; try again once its controller has started")
+        with self.engine.connect() as connection:
+            if (found := schema_of(connection)) != NEWEST:
+                raise DatabaseError(
+                    f"database {self.shown} has schema {found or 'none'}, and this Muster needs {NEWEST}: its controller is another "
+                    "version's; start that again with this version"
+                )
 
     def _migrate(self) -> None:
         with self._unchecked() as connection:
@@ -276,7 +301,7 @@ class Database:
                 bring_up_to_date(connection)
             except NewerSchema as newer:
                 raise DatabaseError(
-                    f"database {_shown(str(self.engine.url))} was written by a newer Muster (schema {newer}); "
+                    f"database {shown(str(self.engine.url))} was written by a newer Muster (schema {newer}); "
                     "install that version, or use another database"
                 ) from None
 
@@ -308,16 +333,6 @@ def _private(path: str, flags: int) -> int:
     return os.open(path, flags, 0o600)
 
 
-def _is_in_memory(url: URL) -> bool:
-    return url.get_backend_name() == "sqlite" and url.database in (None, "", ":memory:")
-
-
-def _shown(url: str) -> str:
-    """The URL without its password."""
-    scheme, sign, rest = url.partition("://")
-    return f"{scheme}{sign}{rest.rpartition('@')[2]}"
-
-
 def _is_damaged(error: Exception) -> bool:
     """Whether SQLite found that the file is not as it wrote it."""
     name = getattr(getattr(error, "orig", None), "sqlite_errorname", "")
@@ -343,14 +358,6 @@ def _is_full(error: Exception) -> bool:
 
 def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0][:500]
-
-
-def _connect_args(url: URL) -> dict[str, Any]:
-    """Options that reveal a vanished PostgreSQL server within seconds; options in the URL take precedence."""
-    if url.get_backend_name() != "postgresql":
-        return {}
-    told = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
-    return {name: value for name, value in {**told, "tcp_user_timeout": 10_000}.items() if name not in url.query}
 
 
 def _read_document(text: str) -> Any:

@@ -237,7 +237,9 @@ class AutomaticEvaluations:
             actor = self._actor_named(training.owner)
             if actor is None:
                 raise ClientError(f"{training.owner}, which submitted the training, is no longer there")
-            spec = automatic_evaluation(run.name, training.spec, training.place, training.wanted, chosen.iteration)
+            # a key's share is the key's, whatever the training's was called when it was submitted
+            place = {key: value for key, value in training.place.items() if key != "share" or actor.share is None}
+            spec = automatic_evaluation(run.name, training.spec, place, training.wanted, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
             def call(known: Known) -> Job:

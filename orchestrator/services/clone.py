@@ -24,7 +24,7 @@ from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
 from orchestrator.services.context import Context, Known, release, using, with_store
 from orchestrator.services.permissions import Actor
-from orchestrator.services.runs import spec_of
+from orchestrator.services.runs import inherited, spec_of
 from orchestrator.services.sources import with_teacher
 from orchestrator.services.spec_submission import Changes, answered, check, submit
 from orchestrator.services.texts import keep_again
@@ -168,6 +168,7 @@ def _changed(session: Session, actor: Actor, source: FoundRun, name: str, change
     document = spec_of(session, actor, source)
     if document is None:
         raise ClientError(f"run {source.name} was not started from a YAML spec: there is nothing to clone")
+    document = inherited(actor, document)
     named = next((each for each in changes.assignments if each.partition("=")[0] == "name"), None)
     if named is not None:
         raise ClientError(f"--set {named[:100]}: a clone has the name that --name gives it")

@@ -10,7 +10,7 @@ from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.persistence.models import Job
 from orchestrator.services.permissions import Actor
-from orchestrator.services.runs import spec_of
+from orchestrator.services.runs import inherited, spec_of
 from orchestrator.services.spec_submission import submit_spec
 from orchestrator.spec.evaluations import document_beside, evaluation_document
 from orchestrator.spec.model import validate
@@ -55,7 +55,7 @@ def _trained(controller: Controller, actor: Actor, run: Run) -> Mapping[str, Any
     """The spec of a training. Raises ClientError where the run is none."""
     found = facts_of(run)
     with controller.database.session() as session:
-        spec = spec_of(session, actor, found) or {}
+        spec = inherited(actor, spec_of(session, actor, found) or {})
     if not spec.get("train"):
         raise ClientError(f"run {run.name} is no training, so it has no policy")
     return spec

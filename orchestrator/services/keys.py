@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TypeVar
 
-from orchestrator.domain.errors import ClientError
-from orchestrator.keys import Key, KeysError, KeyStore, KeyUsageError
+from orchestrator.domain.errors import ClientError, ServerError
+from orchestrator.persistence.access_keys import Key, KeyStore, KeyUsageError
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.permissions import Actor, Operation, Refusal, Shared
 
@@ -20,7 +20,14 @@ def listed(keys: KeyStore | None, actor: Actor) -> list[Key]:
 
 
 def create(
-    keys: KeyStore | None, actor: Actor, name: str, queues: tuple[str, ...], *, read_only: bool, reachable: bool
+    keys: KeyStore | None,
+    actor: Actor,
+    name: str,
+    queues: tuple[str, ...],
+    *,
+    read_only: bool,
+    share: str | None,
+    reachable: bool,
 ) -> Key:
     """A new key, with its secret.
 
@@ -30,14 +37,15 @@ def create(
         name: Of the key.
         queues: Names of the queues that it may use; all where empty.
         read_only: Whether it may change nothing.
+        share: Share identifier of its jobs; the letters and digits of its name where None.
         reachable: Whether other machines can reach the server.
 
     Raises:
-        ClientError: The name can't be used, or the keys can't be written.
+        ClientError: A name can't be used, or the secret can't be sealed.
         Refusal: The actor may not make keys, or not here.
     """
     _check(actor, Operation.CREATE_KEY, reachable)
-    return _carried_out(lambda: _there(keys).create(name, queues, read_only))
+    return _carried_out(lambda: _there(keys).create(name, queues, read_only, share))
 
 
 def delete(keys: KeyStore | None, actor: Actor, name: str, *, reachable: bool) -> None:
@@ -63,10 +71,10 @@ def _check(actor: Actor, operation: Operation, reachable: bool) -> None:
 
 
 def _carried_out(body: Callable[[], T]) -> T:
-    """Raises ClientError for errors of the keys' file, or of the name of a key."""
+    """Raises ClientError for a name that can't be used, and for the sealing key's errors."""
     try:
         return body()
     except KeyUsageError as error:
         raise ClientError(str(error)) from None
-    except KeysError as error:
+    except ServerError as error:
         raise ClientError(str(error), CONFLICT) from None

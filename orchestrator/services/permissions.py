@@ -186,11 +186,13 @@ class Actor:
         name: Of a key, such as ``key ann``, or of a user of this machine.
         queues: Names of the queues that it may use, and whose jobs and runs it may see; None means all.
         read_only: Whether it may change nothing.
+        share: Share identifier of its jobs in queues with a fair-share policy; None where the jobs name theirs.
     """
 
     name: str
     queues: frozenset[str] | None = None
     read_only: bool = False
+    share: str | None = None
 
     def check(self, operation: Operation | AddedOperation, *objects: Object) -> None:
         """Raise Refusal (403, AccessDeniedException) where the actor may not do this to all of these objects."""

@@ -19,7 +19,7 @@ from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
 from orchestrator.services.context import Context, Known, archived, using, with_store
 from orchestrator.services.permissions import Actor
-from orchestrator.services.runs import newest_job, spec_of
+from orchestrator.services.runs import inherited, newest_job, spec_of
 from orchestrator.services.sources import with_teacher
 from orchestrator.services.spec_submission import Changes, answered, submit
 from orchestrator.services.texts import keep_again
@@ -99,6 +99,7 @@ def _resume(
                 raise ClientError(
                     f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
                 )
+            document = inherited(actor, document)
             try:
                 before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
                 changed = override(document, changes.all())

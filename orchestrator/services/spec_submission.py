@@ -135,7 +135,8 @@ def submit(
         TeacherNeeded: Its teacher's weights have to be copied first (:func:`.sources.with_teacher`).
     """
     document = _definition(context, spec, directory)
-    queue = submission.open_queue(context, named_queue(context.session, context.actor, spec.queue), spec.share)
+    queue = named_queue(context.session, context.actor, spec.queue)
+    share = submission.open_queue(context, queue, spec.share)
     properties = with_environment(document["nodeProperties"], environment or {})
     gang = gang_needs(properties)
     definition = definitions.revision(context, spec.name, document, gang, again=False)
@@ -151,7 +152,7 @@ def submit(
             properties=properties,
             gang=gang,
             record=compile_submission(spec, definition_arn(definition.name, definition.revision), environment, tags),
-            share=spec.share,
+            share=share,
             priority=spec.priority,
             attempts=retry["attempts"],
             evaluate_on_exit=retry.get("evaluateOnExit", ()),

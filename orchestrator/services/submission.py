@@ -57,12 +57,12 @@ class Submission:
 
     Attributes:
         name: Of the job.
-        queue: From :func:`open_queue`.
+        queue: Its queue.
         definition: Its job definition.
         properties: Its node properties, with all overrides and parameters.
         gang: What these ask for.
         record: The request as it came, which is kept with the job.
-        share: Share identifier, in a queue with a fair share policy.
+        share: From :func:`open_queue`.
         priority: Within its share.
         attempts: How often it may run.
         evaluate_on_exit: Conditions that retry or end it.
@@ -117,8 +117,11 @@ def _scoped(context: Context) -> str | None:
     return f"{context.actor.name}/{key}"
 
 
-def open_queue(context: Context, queue: JobQueue, share: str | None, priority: int | None = None) -> JobQueue:
-    """The queue, where the actor may submit to it with that share and priority. Raises ClientError."""
+def open_queue(context: Context, queue: JobQueue, share: str | None, priority: int | None = None) -> str | None:
+    """The share of a job in that queue: in one with a fair-share policy, the actor's, who may name no other.
+
+    Raises ClientError where the actor may not submit there, or not with this share and priority.
+    """
     context.actor.check(Operation.SUBMIT_JOB, JobsOf(queue.name))
     if queue.state != "ENABLED":
         raise ClientError(f"Job queue {queue.name} is DISABLED and takes no jobs")
@@ -128,13 +131,20 @@ def open_queue(context: Context, queue: JobQueue, share: str | None, priority: i
             "Job with shareIdentifier or schedulingPriority can onlybe submitted to job queue with fair share "
             "scheduling policy."
         )
+    if queue.policy is not None and (own := context.actor.share) is not None:
+        if share not in (None, own):
+            raise ClientError(
+                f"shareIdentifier {share[:100]!r}: jobs of {context.actor.name} have its share, which is {own}: leave shareIdentifier "
+                "(share in a YAML) out, or use a key of that share"
+            )
+        share = own
     if queue.policy is not None and not share:
         raise ClientError(f"Job queue {queue.name} has a fair share scheduling policy: give a shareIdentifier")
     if share is not None and not re.fullmatch(r"[A-Za-z0-9]{1,255}\*?", share):
         raise ClientError(f"shareIdentifier {share[:100]!r}: 1 to 255 letters and digits, a * at the end at most")
     if priority is not None and not 0 <= priority <= _MOST_PRIORITY:
         raise ClientError(f"schedulingPriorityOverride is {priority}; it must be 0 to {_MOST_PRIORITY}")
-    return queue
+    return share
 
 
 def submit(context: Context, wanted: Submission) -> Job:

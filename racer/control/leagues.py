@@ -23,6 +23,7 @@ from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, using, with_store
 from orchestrator.services.models import any_model, find_model, owner_of_model
 from orchestrator.services.permissions import CONTROLLER, Actor, Owned
+from orchestrator.services.runs import inherited
 from orchestrator.services.spec_submission import submit
 from orchestrator.spec.settings import task_config
 from racer.control import operations
@@ -307,6 +308,7 @@ def _submit(
     """Submit the race of a model. Raises ClientError."""
     _checked(controller, league, model)
     facts = model.facts()
+    facts = {**facts, "spec": inherited(actor, facts.get("spec") or {})}
     controller.writes.check(adds=True)
     controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
 
@@ -316,7 +318,7 @@ def _submit(
             earlier = submission.answered(context)
             if earlier is not None:
                 return submission.answer(earlier)
-            queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
+            queue = str(facts.get("queue") or facts["spec"].get("queue") or "default")
             try:
                 spec = race_job(league, model.reference, facts, queue)
             except SpecError as error:

@@ -33,18 +33,15 @@ LAYERS = {
     "persistence": {"domain", "machine"},
     "engines": {"domain", "machine"},
     "control": {"domain", "machine", "spec", "scheduling", "persistence", "engines"},
-    "services": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control", "keys"},
-    "api": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control", "services", "keys"},
-    "console": {"domain", "spec", "scheduling", "persistence", "control", "services", "api", "keys"},
+    "services": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control"},
+    "api": {"domain", "machine", "spec", "scheduling", "persistence", "engines", "control", "services"},
+    "console": {"domain", "spec", "scheduling", "persistence", "control", "services", "api"},
     "plugins": {"services", "api"},
     "service_manager": {"machine"},
     "home": {"domain"},
-    "keys": {"domain"},
     "client": {"domain", "home"},
-    "server": {
-        *("domain", "engines", "persistence", "control", "services", "api", "console", "plugins", "home", "keys"),
-    },
-    "cli": {"domain", "spec", "engines", "control", "client", "home", "keys", "server", "service_manager"},
+    "server": {"domain", "engines", "persistence", "control", "services", "api", "console", "home", "plugins"},
+    "cli": {"domain", "spec", "engines", "control", "client", "home", "persistence", "server", "service_manager"},
 }
 """What each room of the orchestrator may import beside itself."""
 ADAPTERS = {

@@ -31,8 +31,8 @@ def _submission(context: Context, request: Mapping[str, Any]) -> Submission:
     rules.check_name("jobName", request["jobName"])
     rules.check_tries(request)
     rules.check_tags(request.get("tags") or {})
-    share, override = request.get("shareIdentifier"), request.get("schedulingPriorityOverride")
-    queue = open_queue(context, context.queue(request["jobQueue"]), share, override)
+    queue, override = context.queue(request["jobQueue"]), request.get("schedulingPriorityOverride")
+    share = open_queue(context, queue, request.get("shareIdentifier"), override)
     definition = context.definition(request["jobDefinition"])
     context.actor.check(Operation.SUBMIT_JOB, definition)
     document = definition.document

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hmac
+import re
 import secrets
 import time
 from collections.abc import Mapping
@@ -10,18 +11,19 @@ from dataclasses import dataclass, field
 from hashlib import sha256
 
 from orchestrator.api.http.callers import user_name
-from orchestrator.keys import Key, KeyStore
+from orchestrator.persistence.access_keys import Key, KeyStore
 from orchestrator.services.permissions import CONTROLLER, Actor, Refusal
 
 SESSION = 12 * 3600
 """Seconds for which a login to the console lasts."""
+_ID = re.compile("[A-Z0-9]{16,128}")
 _TOKEN = "token"
 """In a session, in place of an access key id: it was opened with MUSTER_TOKEN."""
 
 
 @dataclass
 class Access:
-    """The ways to be admitted: the keys of the home directory, one token that may do everything, or the controller's own user."""
+    """The ways to be admitted: the keys of the database, one token that may do everything, or the controller's own user."""
 
     keys: KeyStore | None = None
     token: str | None = None
@@ -42,11 +44,19 @@ class Access:
         """The keys in force, by access key id."""
         return self.keys.current() if self.keys else {}
 
+    def is_new(self, access_key_id: str) -> bool:
+        """Whether another process may just have made the key of this id: then :meth:`look_again` before it is refused."""
+        return self.keys is not None and access_key_id not in self.known() and bool(_ID.fullmatch(access_key_id))
+
+    def look_again(self) -> None:
+        """Read the keys of the database; the caller's thread may wait for it."""
+        if self.keys:
+            self.keys.look_again()
+
     def demanded(self) -> bool:
         """Whether requests must be authenticated. Once keys have existed this stays so: deleting or damaging them opens nothing."""
         if not self.exposed:
-            keys = self.known()
-            self.exposed = bool(self.token or keys or (self.keys and self.keys.unusable))
+            self.exposed = bool(self.token or (self.keys and not self.keys.is_empty))
         return self.exposed
 
     def admitted(self) -> str:
@@ -65,6 +75,8 @@ class Access:
 
     def sign_in(self, given: str) -> str:
         """Open a session for the server's token or a key; its text reveals nothing of the secret. Raises Refusal."""
+        if self.is_new(given.partition(":")[0]):
+            self.look_again()
         name, _ = self._proven(given)
         claim = f"{name}.{int(time.time()) + SESSION}.{secrets.token_urlsafe(16)}"
         return f"{claim}.{self._seal(name, claim)}"
@@ -133,4 +145,4 @@ class Access:
 
 def actor_of_key(key: Key) -> Actor:
     """The user of a key."""
-    return Actor(f"key {key.name}", None if key.queues is None else frozenset(key.queues), key.read_only)
+    return Actor(f"key {key.name}", None if key.queues is None else frozenset(key.queues), key.read_only, key.share)

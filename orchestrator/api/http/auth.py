@@ -1,7 +1,7 @@
 """Authentication, in front of every request.
 
 With a token or a key in force a request carries ``Authorization: Bearer …`` (the token, or ``ACCESS_KEY_ID:SECRET``) or an AWS
-Signature Version 4 by a key of :mod:`orchestrator.keys`. Without either the server listens on loopback only, takes requests from
+Signature Version 4 by a key of :mod:`orchestrator.persistence.access_keys`. Without either the server listens on loopback only, takes requests from
 processes of its own user (:mod:`orchestrator.api.http.callers`), and ignores signatures, since AWS clients always sign with something.
 
 A browser has the session of a login to the console (:mod:`orchestrator.console.login`) in a cookie. It counts for the console's pages
@@ -156,9 +156,11 @@ class Guard:
         given = request.single("authorization") or ""
         scheme, _, credentials = given.strip().partition(" ")
         if scheme.lower() == "bearer":
+            await self._look_for(credentials.strip().partition(":")[0])
             return self.access.bearer(credentials.strip())
         if scheme == _ALGORITHM:
             claim = Claim.parse(credentials)
+            await self._look_for(claim.access_key_id)
             key = self.access.known().get(claim.access_key_id)
             if key is None:
                 raise Refusal(
@@ -174,6 +176,11 @@ class Guard:
             "a token is needed: set MUSTER_TOKEN (the server's token, or ACCESS_KEY_ID:SECRET of a key), send it as "
             "'Authorization: Bearer …', or sign with AWS Signature Version 4; `muster keys create NAME` makes a key",
         )
+
+    async def _look_for(self, access_key_id: str) -> None:
+        """See a key that another process has just made; the loop does not wait for the database meanwhile."""
+        if self.access.is_new(access_key_id):
+            await asyncio.to_thread(self.access.look_again)
 
 
 class _Request:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field
 
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.requests import actor_of
-from orchestrator.keys import Key
+from orchestrator.persistence.access_keys import Key
 from orchestrator.services import keys
 
 router = APIRouter()
@@ -25,6 +25,7 @@ class KeyRequest(BaseModel):
     name: str = Field(max_length=128, description="who or what uses it")
     queues: list[str] = Field(default_factory=list, max_length=50, description="those that it may use; all where empty")
     read_only: bool = Field(default=False, alias="readOnly", description="it may look but change nothing")
+    share: str | None = Field(default=None, description="of its jobs; the letters and digits of the name by default")
 
 
 @router.get("/keys")
@@ -36,7 +37,7 @@ def read_keys(request: Request) -> list[dict[str, Any]]:
 @router.post("/keys")
 def make_key(request: Request, body: KeyRequest) -> dict[str, Any]:
     """Create a key; only this answer has its ``secretAccessKey``. From the first key on everybody needs one. Only on loopback."""
-    key = create_key(request, body.name, tuple(body.queues), body.read_only)
+    key = create_key(request, body.name, tuple(body.queues), body.read_only, body.share)
     return {**key.describe(), "secretAccessKey": key.secret}
 
 
@@ -52,10 +53,11 @@ def list_keys(request: Request) -> list[Key]:
     return keys.listed(request.app.state.access.keys, actor_of(request))
 
 
-def create_key(request: Request, name: str, queues: tuple[str, ...], read_only: bool) -> Key:
+def create_key(request: Request, name: str, queues: tuple[str, ...], read_only: bool, share: str | None) -> Key:
     """A new key, with its secret. Raises ClientError."""
     access: Access = request.app.state.access
-    return keys.create(access.keys, actor_of(request), name, queues, read_only=read_only, reachable=access.reachable)
+    limits = {"read_only": read_only, "reachable": access.reachable}
+    return keys.create(access.keys, actor_of(request), name, queues, share=share, **limits)
 
 
 def delete_key(request: Request, name: str) -> None:

@@ -18,7 +18,7 @@ router = APIRouter()
 
 @router.get("/webhooks")
 def list_webhooks(request: Request) -> list[dict[str, Any]]:
-    """The webhooks of the controller's ``--webhooks`` file, without paths and secrets: how many messages wait, and which were given up."""
+    """The webhooks of the controller, without paths and secrets: how many messages wait, and which were given up."""
     actor = actor_of(request)
     actor.check_all_queues(Operation.READ_WEBHOOKS)
     deliveries: Deliveries | None = request.app.state.deliveries

@@ -24,12 +24,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.errors import Unsatisfiable
 
-from orchestrator.keys import KeyStore
 from tests.support.conformance import fuzz_requests as good
 from tests.support.conformance import fuzzing
 from tests.support.conformance.fuzzed import TOKEN, Fuzzed
 from tests.support.conformance.fuzzing import Call
 from tests.support.conformance.keys import client
+from tests.support.keys import HomeKeys
 from tests.support.processes import processes_of
 
 EXAMPLES = int(os.environ.get("MUSTER_FUZZ", "300"))
@@ -158,7 +158,7 @@ def test_bytes_that_are_hardly_http(fuzzed: Fuzzed, data: bytes, token: str) -> 
 
 def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed) -> None:
     """What all these requests have left behind spoils no answer, no pass of the scheduler and no start."""
-    key = KeyStore(fuzzed.home).create("reader")
+    key = HomeKeys(fuzzed.home).create("reader")
     statuses = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING", "SUCCEEDED", "FAILED")
     for _ in range(2):
         batch = client(fuzzed.url, key.access_key_id, key.secret)

@@ -1,4 +1,4 @@
-"""Keys: their file and their command, when they are demanded, what the application learns of who asks, and who that is where no key is demanded."""
+"""Keys: their command and their database, when they are demanded, what the application learns of who asks, and who that is where no key is demanded."""
 
 from __future__ import annotations
 
@@ -26,24 +26,26 @@ from orchestrator.api.http.limits import RateLimit
 from orchestrator.api.http.requests import actor_of
 from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
-from orchestrator.keys import KeyStore
 from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
-from tests.conftest import PATIENCE, Serving, call_muster, run_muster
+from tests.conftest import PATIENCE, Serving, call_muster, run_muster, wait_for
 from tests.support.conformance.keys import client, refused
 from tests.support.conformance.streams import client_of
+from tests.support.keys import HomeKeys, key_store
 
 
-def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -> None:
-    created = json.loads(call_muster("keys", "create", "a", "--read-only", "--json", home=tmp_path).stdout)
-    assert len(created["accessKeyId"]) == 20 and len(created["secretAccessKey"]) == 40
-    path = tmp_path / "keys.json"
+def test_the_command_shows_a_secret_once_and_the_home_keeps_it_sealed(tmp_path: Path) -> None:
+    created = json.loads(call_muster("keys", "create", "a-b", "--read-only", "--json", home=tmp_path).stdout)
+    assert len(created["accessKeyId"]) == 20 and len(created["secretAccessKey"]) == 40 and created["share"] == "ab"
+    path = tmp_path / "sealing.key"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     listed = call_muster("keys", "list", "--json", home=tmp_path).stdout
     assert json.loads(listed)[0] == {key: value for key, value in created.items() if key != "secretAccessKey"}
-    for text in (listed, call_muster("keys", "list", home=tmp_path).stdout, repr(KeyStore(tmp_path).load())):
+    for text in (listed, call_muster("keys", "list", home=tmp_path).stdout, repr(HomeKeys(tmp_path).load())):
         assert created["accessKeyId"] in text and created["secretAccessKey"] not in text
+    found = [file for file in tmp_path.rglob("*") if file.is_file()]
+    assert not [file for file in found if created["secretAccessKey"].encode() in file.read_bytes()]
     path.chmod(0o640)
     for command in (["serve", "--port", "0"], ["keys", "list"], ["keys", "create", "b"]):
         done = call_muster(*command, home=tmp_path)
@@ -56,61 +58,40 @@ def test_the_keys_file_is_its_owners_alone_and_shows_no_secret(tmp_path: Path) -
         ["create", "../x"],
         ["create", "a"],
         ["create", "b", "--queue", "arn:x/y z"],
+        ["create", "b", "--share", "a-b"],
         ["delete", "nobody"],
         ["create", ""],
     ],
 )
 def test_wrong_uses_of_the_command_end_with_one_line(tmp_path: Path, arguments: list[str]) -> None:
-    KeyStore(tmp_path).create("a")
+    HomeKeys(tmp_path).create("a")
     done = call_muster("keys", *arguments, home=tmp_path)
     assert done.returncode == 2 and done.stderr.startswith("muster: ") and done.stderr.count("\n") == 1, done.stderr
-    assert [each.name for each in KeyStore(tmp_path).load().values()] == ["a"]
+    assert [each.name for each in HomeKeys(tmp_path).load().values()] == ["a"]
 
 
-@pytest.mark.parametrize(
-    ("text", "part"),
-    [
-        (b"{", "Invalid JSON"),
-        (b"\xff\xfe\x00", "Invalid JSON"),
-        (b"[]", "should be an object"),
-        (b'{"keys": [{"name": "a"}]}', "keys.0.accessKeyId"),
-        (b"", "Invalid JSON"),
-    ],
-)
-def test_a_damaged_keys_file_is_one_line_at_the_start(tmp_path: Path, text: bytes, part: str) -> None:
-    (tmp_path / "keys.json").write_bytes(text)
-    (tmp_path / "keys.json").chmod(0o600)
-    done = call_muster("serve", "--port", "0", home=tmp_path)
-    assert done.returncode == 1 and done.stderr.count("\n") == 1, done.stderr
-    assert f"{tmp_path}/keys.json: " in done.stderr and part in done.stderr, done.stderr
-
-
-def test_a_keys_file_damaged_later_is_logged_and_its_keys_stay(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    store = KeyStore(tmp_path)
-    key = store.create("a")
-    good = store.path.read_bytes()
-    assert list(store.current()) == [key.access_key_id]
-    store.path.write_bytes(b"damaged")
-    for _ in range(3):
-        assert list(store.current()) == [key.access_key_id]
-    assert [record.message.count("keys.json") for record in caplog.records] == [1], caplog.text
-    assert "until then the 1 keys" in caplog.text and key.secret not in caplog.text
-    store.path.write_bytes(good)
-    store.delete("a")
-    assert store.current() == {}
-    assert not Access(store).demanded()
-    store.path.write_bytes(b"damaged")
-    assert Access(store).demanded()
+def test_the_database_of_the_keys_is_the_one_that_the_controller_is_given(tmp_path: Path) -> None:
+    elsewhere = f"{tmp_path}/other.db"
+    assert call_muster("keys", "create", "before", "--database", elsewhere, home=tmp_path).returncode == 0
+    with Serving(tmp_path, "--cpus", "1", "--database", elsewhere):
+        wrong = call_muster("keys", "create", "a", home=tmp_path)
+        assert wrong.returncode == 2 and f"has its keys in sqlite:///{elsewhere}" in wrong.stderr, wrong.stderr
+        assert call_muster("keys", "create", "a", "--database", elsewhere, home=tmp_path).returncode == 0
+        listed = call_muster("keys", "list", "--json", home=tmp_path, MUSTER_DATABASE=elsewhere).stdout
+    assert [each["name"] for each in json.loads(listed)] == ["before", "a"] and not (tmp_path / "muster.db").exists()
 
 
 def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
-    store = KeyStore(tmp_path)
+    store = HomeKeys(tmp_path)
+
+    def is_refused(url: str) -> bool:
+        return httpx.get(f"{url}/api/runs").status_code == 403
+
     with Serving(tmp_path, "--cpus", "1") as server:
         assert httpx.get(f"{server.url}/api/runs", headers={"Authorization": "AWS4-HMAC-SHA256 x"}).status_code == 200
         client(server.url, "any", "any").list_jobs(jobQueue="default")
         key = store.create("a")
+        wait_for(lambda: is_refused(server.url), what="the server's look at the keys")
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
         done = call_muster("keys", "delete", "a", home=tmp_path)
@@ -122,7 +103,7 @@ def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
 def test_off_loopback_a_key_is_demanded_and_other_web_pages_are_refused(tmp_path: Path) -> None:
     done = call_muster("serve", "--host", "0.0.0.0", "--port", "0", home=tmp_path)
     assert done.returncode == 1 and "muster keys create" in done.stderr and done.stderr.count("\n") == 1, done.stderr
-    key = KeyStore(tmp_path).create("a")
+    key = HomeKeys(tmp_path).create("a")
     with Serving(tmp_path, "--host", "0.0.0.0", "--cpus", "1") as server:
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
         bearer = {"Authorization": f"Bearer {key.access_key_id}:{key.secret}"}
@@ -164,7 +145,7 @@ def test_a_token_or_a_proxy_that_is_not_safe_is_refused_at_the_start(tmp_path: P
     ):
         with pytest.raises(ServerError, match=f"--trust-proxy: {said}"):
             Server(tmp_path, trusted_proxies=[proxy])
-    key = KeyStore(tmp_path).create("wall", read_only=True)
+    key = HomeKeys(tmp_path).create("wall", read_only=True)
     with pytest.raises(ServerError, match=f"MUSTER_TOKEN is the key {key.access_key_id} of a client"):
         Server(tmp_path, token=f"{key.access_key_id}:{key.secret}")
 
@@ -210,7 +191,8 @@ def test_a_home_is_its_users_alone_and_an_open_one_is_closed(tmp_path: Path, cap
 
 
 def test_the_application_sees_who_asks(tmp_path: Path) -> None:
-    key = KeyStore(tmp_path).create("a", ("robots",), read_only=True)
+    store = key_store(tmp_path)
+    key = store.create("a", ("robots",), read_only=True)
 
     def who(request: Request) -> JSONResponse:  # in another thread, as all our operations are
         actor = actor_of(request)
@@ -223,7 +205,7 @@ def test_the_application_sees_who_asks(tmp_path: Path) -> None:
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
             return (await http.get("/", headers={"Authorization": f"Bearer {token}"})).json()
 
-    access = Access(KeyStore(tmp_path), "the-token")
+    access = Access(store, "the-token")
     assert asyncio.run(ask(access, f"{key.access_key_id}:{key.secret}")) == ["key a", ["robots"], True]
     assert asyncio.run(ask(access, "the-token")) == ["MUSTER_TOKEN", [], False]
     assert asyncio.run(ask(access, access.own_token)) == ["this process", [], False]
@@ -231,7 +213,7 @@ def test_the_application_sees_who_asks(tmp_path: Path) -> None:
 
 
 def test_muster_run_gets_into_the_controller_that_it_brings(tmp_path: Path) -> None:
-    KeyStore(tmp_path).create("a")
+    HomeKeys(tmp_path).create("a")
     spec = tmp_path / "job.yaml"
     spec.write_text("name: own\nresources: {cpus: 0.1}\ncommand: ['true']\n")
     assert "MUSTER_TOKEN" not in os.environ
@@ -308,7 +290,7 @@ def test_files_with_secrets_are_private_and_jobs_keep_the_users_umask(shared_ser
     made = shared_server.home / "made by a job"
     job = shared_server.gang(f"open({str(made)!r}, 'w')")
     shared_server.wait(job, "SUCCEEDED")
-    private = ("muster.db", "muster.db-wal", "bus.json", "store", "supervisors")
+    private = ("muster.db", "muster.db-wal", "sealing.key", "bus-users", "store", "supervisors")
     open_to_others = [name for name in private if (shared_server.home / name).stat().st_mode & 0o077]
     assert open_to_others == []
     before = os.umask(0)

@@ -19,10 +19,11 @@ from botocore.exceptions import ClientError
 from botocore.httpsession import URLLib3Session
 
 from orchestrator.client import Client
-from orchestrator.keys import Key, KeyStore
+from orchestrator.persistence.access_keys import Key
 from tests.conftest import Serving, call_muster, wait_for
 from tests.support.conformance.keys import client, refused
 from tests.support.definitions import container, multinode
+from tests.support.keys import HomeKeys
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job/6c4a7d0e-0000-4000-8000-000000000000"
 SIGNATURE_ERRORS = {
@@ -39,7 +40,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def key(home: Path) -> Key:
     """A key that may do everything."""
-    return KeyStore(home).create("admin")
+    return HomeKeys(home).create("admin")
 
 
 @pytest.fixture(scope="module")
@@ -192,7 +193,7 @@ def test_the_bearer_form_of_a_key_and_the_command_work(served: Serving, key: Key
 
 
 def test_a_read_only_key_may_only_read(served: Serving, home: Path) -> None:
-    reader = KeyStore(home).create("reader", read_only=True)
+    reader = HomeKeys(home).create("reader", read_only=True)
     batch = client(served.url, reader.access_key_id, reader.secret)
     assert batch.describe_jobs(jobs=["x"])["jobs"] == []
     batch.list_jobs(jobQueue="default")
@@ -213,19 +214,23 @@ def test_a_read_only_key_may_only_read(served: Serving, home: Path) -> None:
 def test_keys_come_and_go_without_a_restart(served: Serving, home: Path) -> None:
     done = call_muster("keys", "create", "passing", "--queue", "robots", "--queue", "default", home=home)
     assert done.returncode == 0, done.stderr
-    passing = next(each for each in KeyStore(home).load().values() if each.name == "passing")
+    passing = next(each for each in HomeKeys(home).load().values() if each.name == "passing")
     assert passing.queues == ("robots", "default")
     assert f"export MUSTER_TOKEN={passing.access_key_id}:{passing.secret}" in done.stdout
     batch = client(served.url, passing.access_key_id, passing.secret)
     batch.list_jobs(jobQueue="default")
     assert call_muster("keys", "delete", "passing", home=home).returncode == 0
+    bearer = {"Authorization": f"Bearer {passing.access_key_id}:{passing.secret}"}
+    wait_for(
+        lambda: httpx.get(f"{served.url}/api/runs", headers=bearer).status_code == 403, what="the look at the keys"
+    )
     with pytest.raises(ClientError) as caught:
         batch.list_jobs(jobQueue="default")
     assert code(caught)[0] == "UnrecognizedClientException"
 
 
 def test_a_key_for_one_queue_changes_no_tag_of_what_others_depend_on(served: Serving, home: Path) -> None:
-    robots = KeyStore(home).create("robots", ("robots",))
+    robots = HomeKeys(home).create("robots", ("robots",))
     own, prefix = client(served.url, robots.access_key_id, robots.secret), "arn:aws:batch:us-east-1:000000000000:"
     for change in (
         lambda: own.tag_resource(resourceArn=f"{prefix}compute-environment/local", tags={"muster:hosts": "nobody"}),
@@ -310,7 +315,7 @@ def test_a_body_is_refused_by_its_declared_length_and_a_disconnecting_client_doe
 
 
 def test_over_the_rate_boto3_is_throttled_and_gets_through_by_trying_again(tmp_path: Path) -> None:
-    key, other = KeyStore(tmp_path).create("a"), KeyStore(tmp_path).create("b")
+    key, other = HomeKeys(tmp_path).create("a"), HomeKeys(tmp_path).create("b")
     with Serving(tmp_path, "--cpus", "1", "--rate-limit", "5") as server:
         once = client(server.url, key.access_key_id, key.secret)
         with pytest.raises(ClientError, match="key a may send 5 requests per second") as caught:

@@ -9,10 +9,10 @@ import httpx
 import pytest
 
 from orchestrator.console.pages import NAVIGATION
-from orchestrator.keys import KeyStore
-from tests.conftest import Serving
+from tests.conftest import Serving, wait_for
 from tests.support.console.fixtures import Console, secret_of
 from tests.support.console.visitor import Page, Visitor
+from tests.support.keys import HomeKeys
 
 
 def test_a_browser_without_a_session_is_sent_to_the_login_and_back(console: Console) -> None:
@@ -66,7 +66,7 @@ def test_a_logged_out_session_is_over_wherever_it_was_copied_to(console: Console
 
 
 def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_path: Path) -> None:
-    keys = KeyStore(tmp_path)
+    keys = HomeKeys(tmp_path)
     keys.create("other")
     key = keys.create("mine")
     with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url, secret_of(key))) as visitor:
@@ -76,7 +76,7 @@ def test_a_session_ends_with_its_key_and_outlives_a_restart_of_the_server(tmp_pa
         server.start()
         assert visitor.page("/").form_token == token, "forms of open pages go on"
         keys.delete("mine")
-        assert visitor.http.get("/", follow_redirects=False).headers["location"].startswith("/login")
+        wait_for(lambda: visitor.http.get("/", follow_redirects=False).status_code == 303, what="the look at the keys")
 
 
 @pytest.mark.parametrize("way", ["deleted key", "logout"])
@@ -203,15 +203,20 @@ def test_the_list_tells_what_each_key_may_do_and_no_secret(console: Console) -> 
 
 
 def test_a_key_is_made_its_secret_is_shown_once_and_it_works(console: Console) -> None:
-    answer = post(console.visitor(), "/keys/create", name="alice", queue=["lab", "default"], read_only="yes")
+    answer = post(
+        console.visitor(), "/keys/create", name="alice", queue=["lab", "default"], read_only="yes", share="team"
+    )
     (key,) = [key for key in console.keys.load().values() if key.name == "alice"]
-    assert (key.queues, key.read_only) == (("lab", "default"), True)
+    assert (key.queues, key.read_only, key.share) == (("lab", "default"), True, "team")
     assert answer.status_code == 200 and f"MUSTER_TOKEN={secret_of(key)}" in answer.text
     assert answer.headers["cache-control"] == "no-store"
     alice = Visitor(console.url, secret_of(key))
     assert "key alice" in alice.page("/").text
     alice.close()
-    assert key.secret not in console.visitor().page("/keys").source
+    page = console.visitor().page("/keys")
+    assert key.secret not in page.source and "read only team" in page.text
+    wrong = post(console.visitor(), "/keys/create", name="carol", share="a-b")
+    assert wrong.status_code == 400 and "--share 'a-b': 1 to 255 letters and digits" in Page(wrong.text).text
     again = post(console.visitor(), "/keys/create", name="alice")
     assert again.status_code == 400 and "there is a key alice already" in Page(again.text).text
 
@@ -263,13 +268,13 @@ def test_the_first_key_is_made_after_a_warning_and_from_then_on_everybody_needs_
         asked = post(visitor, "/keys/create", name="first")
         assert asked.status_code == 409 and "everybody needs a key, you too" in Page(asked.text).text
         made = post(visitor, "/keys/create", name="first", confirmed="yes")
-        (key,) = KeyStore(tmp_path).load().values()
+        (key,) = HomeKeys(tmp_path).load().values()
         assert key.secret in made.text
         assert visitor.http.get("/keys", follow_redirects=False).headers["location"].startswith("/login")
 
 
 def test_a_server_that_other_machines_can_reach_shows_keys_and_makes_none(tmp_path: Path) -> None:
-    keys = KeyStore(tmp_path)
+    keys = HomeKeys(tmp_path)
     secret = secret_of(keys.create("admin"))
     with (
         Serving(tmp_path, "--cpus", "1", "--host", "0.0.0.0") as server,

@@ -167,7 +167,7 @@ def test_all_that_the_filter_finds_is_stopped_also_beyond_the_page(console: Cons
 # -- queues ------------------------------------------------------------------------------------------------------------
 
 
-POLICY = {"shareDecaySeconds": 600, "shareDistribution": [{"shareIdentifier": "red", "weightFactor": 0.5}]}
+POLICY = {"shareDecaySeconds": 600, "shareDistribution": [{"shareIdentifier": "admin", "weightFactor": 0.5}]}
 
 
 @pytest.fixture(scope="module")
@@ -179,7 +179,7 @@ def waiting(console: Console) -> dict[str, str]:
     console.client.batch("CreateJobQueue", **shared, computeEnvironmentOrder=order)
     definition = console.register("waits")
     found = {queue: console.submit(definition, f"in-{queue}", queue) for queue in ("default", "lab")}
-    job = {"jobName": "in-shared", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "red"}
+    job = {"jobName": "in-shared", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "admin"}
     found["shared"] = console.client.batch("SubmitJob", **job)["jobId"]
 
     def has_all() -> Any:
@@ -210,7 +210,7 @@ def test_why_a_job_waits_is_what_the_api_says(console: Console, waiting: dict[st
     assert not rows_of(page, waiting["default"]) and rows_of(page, waiting["shared"])
     (told,) = console.client.get("/api/queues", queue="shared")["queues"]
     (front,) = told["front"]
-    assert (front["id"], front["reason"], front["share"]) == (waiting["shared"], reason, "red")
+    assert (front["id"], front["reason"], front["share"]) == (waiting["shared"], reason, "admin")
 
 
 def test_a_key_sees_its_queues_alone(console: Console, waiting: dict[str, str]) -> None:
@@ -238,16 +238,16 @@ def test_one_stream_renews_all_tables(console: Console, waiting: dict[str, str])
 
 def test_a_share_in_use_is_told_with_its_weight_and_the_host_as_full(console: Console, waiting: dict[str, str]) -> None:
     definition = console.register("runs", cpus="1", command=["sleep", "600"])
-    job = {"jobName": "runs", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "red"}
+    job = {"jobName": "runs", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "admin"}
     running = console.client.batch("SubmitJob", **job)["jobId"]
     await_status(console.client, running, "RUNNING")
     told = console.client.get("/api/queues", queue="shared")
     (share,) = told["queues"][0]["shares"]
-    assert (share["share"], share["weight"], share["inUse"]) == ("red", 0.5, {"cpus": 1.0, "gpus": 0})
+    assert (share["share"], share["weight"], share["inUse"]) == ("admin", 0.5, {"cpus": 1.0, "gpus": 0})
     assert share["score"] == pytest.approx(share["used"] * 0.5)
     assert told["hosts"][0]["inUse"]["cpus"] == 1.0 and told["queues"][0]["inUse"] == {"cpus": 1.0, "gpus": 0}
     page = console.visitor().page("/queues")
-    assert rows_of(page, "shared/red") and "1 of 1" in page.text
+    assert rows_of(page, "shared/admin") and "1 of 1" in page.text
     console.client.batch("TerminateJob", jobId=running, reason="enough")
     await_status(console.client, running, "FAILED")
 

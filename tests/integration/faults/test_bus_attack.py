@@ -53,7 +53,7 @@ class Victim:
 
 @pytest.fixture(scope="module")
 def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
-    bus = Bus(tmp_path_factory.mktemp("home"))
+    bus = Bus(tmp_path_factory.mktemp("home"), {})
     bus.open()
     bus.expect("victim", 1, nodes=2)
     bus.expect("mallory", 1, nodes=2)
@@ -252,7 +252,7 @@ def test_invented_keys_leave_nothing_in_the_controller(bus: Bus, victim: Victim)
 
 
 def test_messages_of_a_closed_attempt_are_dropped(tmp_path: Path) -> None:
-    bus = Bus(tmp_path)
+    bus = Bus(tmp_path, {})
     bus.open()
     try:
         bus.expect("victim", 1, nodes=2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from orchestrator.control.account import DEFAULT, recognise
 from orchestrator.control.usage import add_usage, charge, resource_seconds, usage_at
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.errors import ApiError, RequestError, ServerError, UsageError
+from orchestrator.persistence.access_keys import KeyStore, KeyUsageError
 from orchestrator.persistence.models import (
     Attempt,
     Base,
@@ -31,6 +33,7 @@ from orchestrator.persistence.models import (
     now,
 )
 from orchestrator.persistence.own_models import RetentionStart, RunUse
+from orchestrator.persistence.own_secrets import OwnSecrets
 from orchestrator.persistence.queries import find_job
 from orchestrator.persistence.schema import NEWEST
 from orchestrator.persistence.session import Database, DatabaseError
@@ -100,6 +103,28 @@ def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, ope
         assert recognise(session, None, None) == DEFAULT, "its clients know these ARNs"
         with pytest.raises(UsageError, match="000000000000 in us-east-1 since its first start"):
             recognise(session, "123456789012", None)
+
+
+def test_keys_and_secrets_are_in_either_database_for_a_process_beside_its_controller(
+    url: str, opened: Callable[[], Database], tmp_path: Path
+) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    own = OwnSecrets(opened(), home)
+    own["console"] = "a secret"
+    keys = KeyStore(own)
+    ann, bob = keys.create("ann", ["robots"]), keys.create("bob", share="lab")
+    beside = Database(url, beside=True)
+    try:
+        there = OwnSecrets(beside, home)
+        others = KeyStore(there)
+        assert list(others.current().values()) == [ann, bob] and there.get("console") == "a secret"
+        others.delete("ann")
+        with pytest.raises(KeyUsageError, match="there is a key bob already"):
+            others.create("bob")
+    finally:
+        beside.close()
+    assert list(keys.load().values()) == [bob]
 
 
 def test_an_older_database_begins_with_retention_at_its_upgrade(url: str, opened: Callable[[], Database]) -> None:
@@ -221,6 +246,7 @@ def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path:
         assert set(modes.values()) == {0o600}, modes
         first.close()
         path.chmod(0o644)
+        shutil.copy2(tmp_path / "a" / "sealing.key", tmp_path / "b")
         Server(tmp_path / "b", store=store, database=how.format(path)).close()
         assert path.stat().st_mode & 0o777 == 0o600
     finally:

@@ -18,13 +18,13 @@ from orchestrator.client import Client
 from orchestrator.control.retention import RunNeeded
 from orchestrator.control.run_store import RunStore
 from orchestrator.domain.errors import ApiError
-from orchestrator.keys import KeyStore
 from orchestrator.server import Server
 from shared_store.volume import contents, models, trash
 from shared_store.volume.bundles import seal
 from shared_store.volume.checkpoints import list_checkpoints
 from tests.conftest import Serving
 from tests.support.definitions import container, multinode, single
+from tests.support.keys import HomeKeys
 from tests.support.orchestrator.jobs import refused
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 
@@ -151,7 +151,7 @@ def test_rules_are_checked_where_they_are_set(server: Serving) -> None:
 
 def test_a_run_is_archived_and_deleted_by_its_owner_and_keys_with_all_queues_alone(tmp_path: Path) -> None:
     tokens = {
-        name: KeyStore(tmp_path).create(name, queues)
+        name: HomeKeys(tmp_path).create(name, queues)
         for name, queues in (("admin", ()), ("a", ("default",)), ("b", ("default",)))
     }
     with Serving(tmp_path, "--cpus", "2") as server:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from sqlalchemy import select
@@ -22,6 +23,7 @@ from orchestrator.persistence.own_models import WebhookDelivery
 from orchestrator.server import Server
 from tests.conftest import Serving, submit_gang
 from tests.support.orchestrator import rows
+from tests.support.orchestrator.jobs import serving
 from tests.support.orchestrator.receiver import SECRET, Receiver, receiving, write_webhooks
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
@@ -198,9 +200,7 @@ def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: 
     server.close()
 
 
-def test_messages_of_an_unknown_webhook_are_given_up_only_by_a_controller_with_webhooks(
-    tmp_path: Path,
-) -> None:
+def test_messages_of_an_unknown_webhook_wait_for_a_controller_that_is_not_a_commands(tmp_path: Path) -> None:
     with receiving() as gone:
         here = {"url": gone.url}
     home = tmp_path / "home"
@@ -214,9 +214,33 @@ def test_messages_of_an_unknown_webhook_are_given_up_only_by_a_controller_with_w
         (None, None),
         (write_webhooks(tmp_path / "hooks.json", other=here), "no webhook is called so"),
     ):
-        server = Server(home, cpus=1, webhooks=file)
+        server = Server(home, cpus=1, webhooks=file, temporary=file is None)
         server.start()
         with server.controller.database.session() as session:
             (row,) = session.scalars(select(WebhookDelivery))
             assert (row.problem or "").startswith(problem or "") and (row.next_at is None) == (problem is not None)
         server.close()
+
+
+def test_the_database_keeps_the_webhooks_until_another_file_replaces_them(tmp_path: Path, receiver: Receiver) -> None:
+    home, file = tmp_path / "home", tmp_path / "hooks.json"
+
+    def names(webhooks: str | None = None, **options: Any) -> list[str]:
+        with serving(home, webhooks=webhooks, **options) as client:
+            return [each["name"] for each in client.get("/api/webhooks")]
+
+    assert names(write_webhooks(file, chat={"url": receiver.url}, log={"url": receiver.url, "queues": ["x"]})) == [
+        "chat",
+        "log",
+    ]
+    file.unlink()
+    with serving(home) as client:
+        job = submit_gang(client, "print(1)")
+        wait_for(lambda: receiver.of(job), 20, "the message")
+        ((headers, body),) = receiver.of(job)
+        assert is_signed(headers, body)
+        wait_for(lambda: client.get("/api/webhooks")[0]["waiting"] == 0, 20, "its acceptance")
+    end_all(tmp_path)
+    assert names(temporary=True) == [], "the controller of `muster run` sends none"
+    assert names(write_webhooks(file, other={"url": receiver.url})) == names() == ["other"]
+    assert names(write_webhooks(file)) == names() == []

@@ -11,7 +11,6 @@ import httpx
 
 from orchestrator.api.logs import operations as logs
 from orchestrator.client import Client
-from orchestrator.keys import KeyStore
 from orchestrator.services.permissions import HIDDEN
 from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.model import validate
@@ -21,6 +20,7 @@ from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.layout import Store
 from tests.conftest import Serving
 from tests.support.definitions import container, multinode
+from tests.support.keys import HomeKeys
 
 TOKEN = "a-token-for-tests-alone"
 KEYS = ("admin", "token", "robots", "lab", "reader", "robots-reader", "lab-reader")
@@ -44,7 +44,7 @@ class World:
         kept = {"robots": ("robots",), "robots-reader": ("robots",), "lab": ("lab",), "lab-reader": ("lab",)}
         self.tokens = {"token": TOKEN}
         for name in (name for name in KEYS if name != "token"):
-            key = KeyStore(home).create(name, kept.get(name), read_only=name.endswith("reader"))
+            key = HomeKeys(home).create(name, kept.get(name), read_only=name.endswith("reader"))
             self.tokens[name] = f"{key.access_key_id}:{key.secret}"
         os.environ["MUSTER_TOKEN"] = TOKEN
         try:
@@ -129,7 +129,7 @@ class World:
 
     def delete_key(self, key: str) -> httpx.Response:
         """Delete a key that was just made."""
-        name = KeyStore(self.server.home).create(self.fresh()).name
+        name = HomeKeys(self.server.home).create(self.fresh()).name
         bearer = {"Authorization": f"Bearer {self.tokens[key]}"}
         return self.http.delete(f"{self.url}/api/keys/{name}", headers=bearer)
 

@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
+import httpx
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.keys import Key, KeyStore
+from orchestrator.persistence.access_keys import Key
 from tests.conftest import Serving
 from tests.support.browser import launched
 from tests.support.console.visitor import Visitor
 from tests.support.definitions import container, multinode
+from tests.support.keys import HomeKeys
+from tests.support.waiting import wait_for
 
 if TYPE_CHECKING:
     from playwright.sync_api import Browser
@@ -24,8 +27,9 @@ class Console:
     """A server with the keys ``admin``, ``reader`` (reads all) and ``lab`` (the queue ``lab`` alone); nothing of it runs any job."""
 
     def __init__(self, server: Serving) -> None:
-        self.server, self.url, self.keys = server, server.url, KeyStore(server.home)
+        self.server, self.url, self.keys = server, server.url, HomeKeys(server.home)
         made = (self.keys.create("admin"), self.keys.create("reader", None, True), self.keys.create("lab", ("lab",)))
+        wait_for(lambda: httpx.get(f"{self.url}/api/runs").status_code == 403, what="the server's look at the keys")
         self.secrets = {key.name: secret_of(key) for key in made}
         self.client = Client(self.url, self.secrets["admin"])
         order = [{"order": 1, "computeEnvironment": "local"}]

@@ -18,12 +18,13 @@ from pathlib import Path
 
 import pytest
 
-from shared_store.volume.files import read_json
+from orchestrator.persistence.own_secrets import BUS_PORT
 from shared_store.volume.layout import Run
 from tests.support.faults.checks import Reference, Verdict, judge
 from tests.support.faults.fire import run_straight, write_spec
 from tests.support.faults.full_disk import fill
 from tests.support.faults.home import Broken, Home, reached
+from tests.support.keys import put_secret, secret_of_home
 from tests.support.processes import end_all
 from tests.support.waiting import wait_for
 
@@ -60,10 +61,14 @@ def loop_volume(directory: Path) -> Iterator[Path]:
         image.unlink()
 
 
-@contextlib.contextmanager
-def partition(home: Home) -> Iterator[None]:
+def partition(home: Home) -> AbstractContextManager[None]:
     """No packet passes between the controller's bus and its nodes."""
-    port = (read_json(home.path / "bus.json") or {})["port"]
+    return cut(secret_of_home(home.path, BUS_PORT))
+
+
+@contextlib.contextmanager
+def cut(port: str | None) -> Iterator[None]:
+    """No packet passes to or from this port of loopback."""
     rules = [(chain, "-i" if chain == "INPUT" else "-o", way) for chain in ("INPUT", "OUTPUT") for way in ("s", "d")]
     for chain, side, way in rules:
         root("iptables", "-I", chain, side, "lo", "-p", "tcp", f"--{way}port", port, "-j", "DROP")
@@ -109,7 +114,7 @@ def moved(home: Home) -> Iterator[None]:
     """The controller ends, and another one begins at another address, which nodes do not know."""
     home.close()
     yield
-    (home.path / "bus.json").unlink()
+    put_secret(home.path, BUS_PORT, "0")
     home.serve()
 
 

@@ -50,7 +50,7 @@ class FakeController(Generic[E]):
         peers = Peers(self.store, home)
         runs = store_type(self.store, peers)
         self.controller = Controller.assemble(
-            self.database, engines, self.store, Bus(home), peers, interval=0.02, runs=runs
+            self.database, engines, self.store, Bus(home, {}), peers, interval=0.02, runs=runs
         )
         stack.callback(self.controller.close)
 

@@ -44,11 +44,11 @@ def test_a_server_waits_for_a_command_s_controller_and_not_for_a_server(
     holder: HomeLock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pauses = while_it_waits(monkeypatch, holder.release)
-    holder.publish(URL, True, "us-east-1")
+    holder.publish(URL, True, "us-east-1", "sqlite:///d")
     HomeLock(tmp_path).release()
     assert len(pauses) == 1
     server = HomeLock(tmp_path)
-    server.publish(URL, False, "us-east-1")
+    server.publish(URL, False, "us-east-1", "sqlite:///d")
     with pytest.raises(ControllerRuns, match=f"already served by a controller .*{URL}"):
         HomeLock(tmp_path)
     assert len(pauses) == 1
@@ -57,14 +57,14 @@ def test_a_server_waits_for_a_command_s_controller_and_not_for_a_server(
 def test_a_command_waits_for_another_controller_until_that_listens(
     holder: HomeLock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pauses = while_it_waits(monkeypatch, lambda: holder.publish(URL, True, "us-east-1"))
+    pauses = while_it_waits(monkeypatch, lambda: holder.publish(URL, True, "us-east-1", "sqlite:///d"))
     with pytest.raises(ControllerRuns, match=URL):
         HomeLock(tmp_path, temporary=True)
     assert len(pauses) == 1
 
 
 def test_nobody_waits_without_end(holder: HomeLock, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    holder.publish(URL, True, "us-east-1")
+    holder.publish(URL, True, "us-east-1", "sqlite:///d")
     now = time.monotonic()
     pauses = while_it_waits(monkeypatch, lambda: monkeypatch.setattr(time, "monotonic", lambda: now + 60.0))
     with pytest.raises(ControllerRuns, match=URL):

@@ -8,15 +8,16 @@ import pytest
 
 from orchestrator.api.http import access
 from orchestrator.api.http.access import Access
-from orchestrator.keys import KeyStore
+from orchestrator.persistence.access_keys import KeyStore
 from orchestrator.services.permissions import Actor, Refusal
+from tests.support.keys import key_store
 
 SECRET = bytes(32)
 
 
 @pytest.fixture
 def keys(tmp_path: Path) -> KeyStore:
-    return KeyStore(tmp_path)
+    return key_store(tmp_path)
 
 
 def given(keys: KeyStore, name: str) -> str:
@@ -28,7 +29,7 @@ def test_a_session_has_the_rights_of_its_key_as_they_are_now(keys: KeyStore) -> 
     keys.create("a", ("robots",), read_only=True)
     here = Access(keys, console_secret=SECRET)
     session = here.sign_in(given(keys, "a"))
-    assert here.session(session) == Actor("key a", frozenset({"robots"}), True)
+    assert here.session(session) == Actor("key a", frozenset({"robots"}), True, "a")
     keys.delete("a")
     keys.create("a")
     assert here.session(session) is None, "another key of the same name"

@@ -19,7 +19,8 @@ from starlette.types import Message, Receive, Scope, Send
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import Guard
 from orchestrator.api.http.limits import RateLimit
-from orchestrator.keys import Key, KeyStore
+from orchestrator.persistence.access_keys import Key, KeyStore
+from tests.support.keys import key_store
 
 HOST = "controller.example:7777"
 LETTERS = "abcxyzABCXYZ0189"
@@ -51,7 +52,7 @@ class Sent:
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> KeyStore:
-    store = KeyStore(tmp_path_factory.mktemp("home"))
+    store = key_store(tmp_path_factory.mktemp("home"))
     store.create("admin")
     return store
 

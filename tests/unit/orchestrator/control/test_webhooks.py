@@ -36,7 +36,7 @@ def test_the_file_names_receivers_whose_secrets_and_paths_are_not_shown(tmp_path
     chat, log = read_webhooks(path)
     assert (chat.name, chat.receiver, chat.statuses) == ("chat", "https://chat.example:8443", ["FAILED"])
     assert (log.statuses, log.queues, log.kinds) == (["SUCCEEDED", "FAILED"], None, None)
-    assert SECRET not in repr(chat) and read_webhooks(None) == ()
+    assert SECRET not in repr(chat)
 
 
 SHORT = "whsec_c2hvcnQ="
@@ -71,7 +71,7 @@ def test_a_missing_or_publicly_readable_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(WebhooksError, match="others can read these secrets; chmod 600"):
         read_webhooks(str(path))
     path.chmod(0o600)
-    for text in ("{", "[]", "{}", '{"a b": {}}', '{"a": {"name": "b"}}'):
+    for text in ("{", "[]", '{"a b": {}}', '{"a": {"name": "b"}}'):
         path.write_text(text)
         with pytest.raises(WebhooksError, match=r"not JSON|expected a JSON object|is no name of a webhook"):
             read_webhooks(str(path))
