@@ -118,7 +118,7 @@ def test_checks_of_the_longest_reward_functions_take_turns_and_leave_the_server_
 def test_a_reward_function_that_is_tried_tells_nothing_of_the_server(console: Console) -> None:
     """It passes the guard's look at the text; the files are there, and the server can read them."""
     visitor = console.visitor()
-    for path in (console.server.home / "keys.json", Path("/etc/passwd"), Path("/proc/self/environ")):
+    for path in (console.server.home / "sealing.key", Path("/etc/passwd"), Path("/proc/self/environ")):
         assert path.read_bytes()
         code = "import numpy as np\n\n\ndef reward_function(params):\n"
         code += f"    lines = np.ma.core.inspect.linecache.getlines({str(path)!r})\n    raise ValueError(lines)\n"
