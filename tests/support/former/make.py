@@ -27,20 +27,12 @@ from tests.support.definitions import container, multinode
 from tests.support.former.archive import ARCHIVE, FACTS, LIBRARIES, processor
 from tests.support.former.environment import COMMIT, make_environment
 from tests.support.former.serving import FormerServing
+from tests.support.former.specs import COMMAND, TRAINING
 from tests.support.orchestrator.receiver import SECRET
 from tests.support.processes import end_all, gang_members
 from tests.support.suite.caches import kernel_cache
 from tests.support.waiting import wait_for
 
-_TRAINING: dict[str, Any] = {
-    "name": "whole",
-    "nodes": 2,
-    "resources": {"cpus": 0.5, "memory": "1GiB"},
-    "train": {"task": "Cartpole", "worlds": 8, "iterations": 60, "seed": 1, "ppo": {"hidden_sizes": [16, 16]}},
-    "checkpoint": {"every": 10, "keep": 10},
-    "retry": {"attempts": 3},
-}
-_COMMAND: dict[str, Any] = {"resources": {"cpus": 0.5, "memory": "64MiB"}, "retry": {"attempts": 1}}
 _WEBHOOK = {"url": "http://127.0.0.1:1/hooks", "secret": SECRET, "queues": ["robots"]}
 _LEFT_OUT = {"kernels", "ray", "controllers", "controller.json", "muster.db-shm"}
 _MADE_AGAIN = (".lock", ".png", ".sock")
@@ -112,19 +104,21 @@ def _run_to_the_end(server: FormerServing, base: Path) -> dict[str, str]:
             tags={"team": queue},
             **more,
         )
-    jobs = {"whole": _submit(server, base, _TRAINING)}
+    jobs = {"whole": _submit(server, base, TRAINING)}
     run = _ended(server, jobs["whole"])["run"]
     for words in (["evaluate", run, "--episodes", "4"], ["export", run], ["models", "register", run, "--name", "pole"]):
         done = server.muster(*words)
         assert done.returncode == 0, done.stdout + done.stderr
+    ids = {job["jobName"]: job["jobId"] for job in server.answer("list")}
+    jobs |= {kind: ids[f"{kind}-{run}"] for kind in ("evaluate", "export")}
     changed = ["--set", "train.iterations=2", "--set", "nodes=1"]
     jobs["clone"] = server.answer("clone", f"{run}@30", "--name", "clone", *changed)["jobId"]
     _ended(server, jobs["clone"])
     jobs["gang"] = _submit(
-        server, base, {**_COMMAND, "name": "gang", "nodes": 2, "command": ["echo", "a line of the gang"]}
+        server, base, {**COMMAND, "name": "gang", "nodes": 2, "command": ["echo", "a line of the gang"]}
     )
     _ended(server, jobs["gang"])
-    jobs["failed"] = _submit(server, base, {**_COMMAND, "name": "failed", "command": ["sh", "-c", "echo no; exit 3"]})
+    jobs["failed"] = _submit(server, base, {**COMMAND, "name": "failed", "command": ["sh", "-c", "echo no; exit 3"]})
     _ended(server, jobs["failed"], "FAILED")
     needs = container(["echo", "child"], "0.5")
     server.client.batch("RegisterJobDefinition", **multinode("plain", needs, 1, tags={"muster:queues": "robots"}))
@@ -133,13 +127,13 @@ def _run_to_the_end(server: FormerServing, base: Path) -> dict[str, str]:
 
 def _leave_running(server: FormerServing, base: Path) -> dict[str, str]:
     """Jobs that are not over: one that runs, one that waits for its end, one that waits for its processors."""
-    jobs = {"cut": _submit(server, base, {**_TRAINING, "name": "cut"})}
+    jobs = {"cut": _submit(server, base, {**TRAINING, "name": "cut"})}
     run = Store(server.home / "store").run(server.detail(jobs["cut"])["run"])
     after = server.client.batch(
         "SubmitJob", jobName="after", jobQueue="default", jobDefinition="plain", dependsOn=[{"jobId": jobs["cut"]}]
     )
     jobs["after"] = after["jobId"]
-    full = {**_COMMAND, "name": "waiting", "queue": "robots", "resources": {"cpus": 2, "memory": "64MiB"}}
+    full = {**COMMAND, "name": "waiting", "queue": "robots", "resources": {"cpus": 2, "memory": "64MiB"}}
     jobs["waiting"] = _submit(server, base, {**full, "command": ["echo", "had room"]})
     wait_for(lambda: len(list_checkpoints(run)) >= 2, 120, "the second checkpoint")
     for rank in gang_members(server.home, "rank"):  # it must not end while the jobs are listed
@@ -153,7 +147,7 @@ def _cut(server: FormerServing, job: str) -> None:
     end_all(server.home)
     run = next(run for run in Store(server.home / "store").runs() if run.name.startswith("cut"))
     reached = [checkpoint.iteration for checkpoint in list_checkpoints(run)]
-    if not reached or reached[-1] >= _TRAINING["train"]["iterations"]:
+    if not reached or reached[-1] >= TRAINING["train"]["iterations"]:
         raise SystemExit(f"the training {job} had the checkpoints {reached} when it was killed: begin again")
 
 

@@ -1,4 +1,4 @@
-"""A server of an older commit: its ``muster serve`` on a home, and its command."""
+"""Serving a home whose keys a test has: by the ``muster serve`` of today, or of an older commit."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from tests.conftest import Serving
 from tests.support.waiting import PATIENCE
 
 
-class FormerServing(Serving):
-    """``command`` is how the commit's ``muster`` is called; ``key`` is what its command and the client show, if any."""
+class KeyServing(Serving):
+    """Today's; its client and its command show ``key``, if there is one."""
 
-    def __init__(self, home: Path, command: tuple[str, ...], *options: str, key: str | None = None) -> None:
-        self.command, self.key = command, key
+    def __init__(self, home: Path, *options: str, key: str | None = None) -> None:
+        self.key = key
         super().__init__(home, *options)
 
     def start(self) -> None:
@@ -25,23 +25,30 @@ class FormerServing(Serving):
         self.client = Client(self.url, self.key)
 
     def muster(self, *arguments: str, **env: Any) -> subprocess.CompletedProcess[str]:
+        return super().muster(*arguments, **(env if self.key is None else {"MUSTER_TOKEN": self.key, **env}))
+
+    def answer(self, *arguments: str) -> Any:
+        """What a command says as JSON."""
+        done = self.muster(*arguments, "--json")
+        assert done.returncode == 0, f"muster {' '.join(arguments)}: {done.stdout}{done.stderr}"
+        return json.loads(done.stdout)
+
+
+class FormerServing(KeyServing):
+    """An older commit's: ``command`` is how its ``muster`` is called."""
+
+    def __init__(self, home: Path, command: tuple[str, ...], *options: str, key: str | None = None) -> None:
+        self.command = command
+        super().__init__(home, *options, key=key)
+
+    def muster(self, *arguments: str, **env: Any) -> subprocess.CompletedProcess[str]:
         """The commit's own command, in a directory that every machine has, since a job keeps its name."""
+        shown = {"MUSTER_TOKEN": self.key} if self.key else {}
         return subprocess.run(
             [*self.command, *arguments],
-            env={
-                **os.environ,
-                "MUSTER_HOME": str(self.home),
-                **({"MUSTER_TOKEN": self.key} if self.key else {}),
-                **env,
-            },
+            env={**os.environ, "MUSTER_HOME": str(self.home), **shown, **env},
             cwd="/",
             capture_output=True,
             text=True,
             timeout=300 * PATIENCE,
         )
-
-    def answer(self, *arguments: str) -> Any:
-        """What the commit's command says as JSON."""
-        done = self.muster(*arguments, "--json")
-        assert done.returncode == 0, f"muster {' '.join(arguments)}: {done.stdout}{done.stderr}"
-        return json.loads(done.stdout)
