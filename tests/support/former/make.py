@@ -26,7 +26,7 @@ from shared_store.volume.layout import Store
 from tests.support.definitions import container, multinode
 from tests.support.former.archive import ARCHIVE, FACTS, LIBRARIES, processor
 from tests.support.former.environment import COMMIT, make_environment
-from tests.support.former.serving import FormerServing
+from tests.support.former.serving import FormerServing, create_key
 from tests.support.former.specs import COMMAND, TRAINING
 from tests.support.orchestrator.receiver import SECRET
 from tests.support.processes import end_all, gang_members
@@ -63,12 +63,8 @@ def _make_home(base: Path, home: Path) -> dict[str, Any]:
     webhooks = home / "webhooks.json"
     webhooks.touch(mode=0o600)
     webhooks.write_text(json.dumps({"chat": _WEBHOOK}))
-    with FormerServing(home, command, "--cpus", "2", "--webhooks", str(webhooks)) as server:
-        keys = {}
-        for name, *rights in (["me"], ["alice", "--queue", "robots"], ["wall", "--read-only"]):
-            key = server.answer("keys", "create", name, *rights)
-            keys[name] = f"{key['accessKeyId']}:{key['secretAccessKey']}"
-        server.close()
+    rights = {"me": [], "alice": ["--queue", "robots"], "wall": ["--read-only"]}
+    keys = {name: create_key(command, home, name, *options) for name, options in rights.items()}
     with FormerServing(home, command, "--cpus", "2", "--webhooks", str(webhooks), key=keys["me"]) as server:
         jobs = _run_to_the_end(server, base)
         jobs |= _leave_running(server, base)

@@ -34,6 +34,26 @@ class KeyServing(Serving):
         return json.loads(done.stdout)
 
 
+def call_former(command: tuple[str, ...], home: Path, *arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """An older commit's ``muster``, in a directory that every machine has, since a job keeps its name."""
+    return subprocess.run(
+        [*command, *arguments],
+        env={**os.environ, "MUSTER_HOME": str(home), **env},
+        cwd="/",
+        capture_output=True,
+        text=True,
+        timeout=300 * PATIENCE,
+    )
+
+
+def create_key(command: tuple[str, ...], home: Path, name: str, *rights: str) -> str:
+    """Have an older commit make an access key; returns it as clients show it."""
+    done = call_former(command, home, "keys", "create", name, *rights, "--json")
+    assert done.returncode == 0, done.stderr
+    key = json.loads(done.stdout)
+    return f"{key['accessKeyId']}:{key['secretAccessKey']}"
+
+
 class FormerServing(KeyServing):
     """An older commit's: ``command`` is how its ``muster`` is called."""
 
@@ -42,13 +62,6 @@ class FormerServing(KeyServing):
         super().__init__(home, *options, key=key)
 
     def muster(self, *arguments: str, **env: Any) -> subprocess.CompletedProcess[str]:
-        """The commit's own command, in a directory that every machine has, since a job keeps its name."""
-        shown = {"MUSTER_TOKEN": self.key} if self.key else {}
-        return subprocess.run(
-            [*self.command, *arguments],
-            env={**os.environ, "MUSTER_HOME": str(self.home), **shown, **env},
-            cwd="/",
-            capture_output=True,
-            text=True,
-            timeout=300 * PATIENCE,
+        return call_former(
+            self.command, self.home, *arguments, **({"MUSTER_TOKEN": self.key} if self.key else {}), **env
         )
