@@ -21,8 +21,8 @@ __version__ = "0.1.0"
 class _OldNames:
     """Finder and loader of modules under the names that they had before they moved."""
 
-    def __init__(self, names: Mapping[str, str]) -> None:
-        self._names = names
+    def __init__(self, names: Mapping[str, str], members: Mapping[str, str]) -> None:
+        self._names, self._members = names, members
         self._specs: dict[str, ModuleSpec | None] = {}
 
     def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
@@ -34,27 +34,36 @@ class _OldNames:
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """The module has run already; it keeps its own spec, which the import has just replaced."""
+        """The module has run already; it keeps its own spec, which the import has just replaced, and gets the members that left it."""
         assert module.__spec__ is not None
-        module.__spec__ = self._specs[module.__spec__.name]
+        old = module.__spec__.name
+        module.__spec__ = self._specs[old]
+        for member, new in self._members.items():
+            if member.rpartition(".")[0] == old:
+                home, _, name = new.rpartition(".")
+                setattr(module, member.rpartition(".")[2], getattr(import_module(home), name))
 
 
-def keep_old_names(names: Mapping[str, str]) -> None:
+def keep_old_names(names: Mapping[str, str], members: Mapping[str, str] | None = None) -> None:
     """Let modules be imported by their old names, too, since tasks and engines of others may hold these.
 
     Args:
         names: Old name → new name. A package needs an entry for each of its modules that is still imported by its old name.
+        members: The same of members that moved out of such a module, with the names of the modules in front.
     """
-    sys.meta_path.insert(0, _OldNames(names))
+    sys.meta_path.insert(0, _OldNames(names, members or {}))
 
 
 OLD_NAMES = {
+    "shared_store.cgroups": "shared_store.process.cgroups",
     "shared_store.checkpoints": "shared_store.volume.checkpoints",
     "shared_store.file_fields": "shared_store.contract.file_fields",
     "shared_store.layout": "shared_store.volume.layout",
+    "shared_store.nodes": "shared_store.process.node_processes",
     "shared_store.policy_contract": "shared_store.contract.policy",
     "shared_store.ports": "shared_store.process.ports",
     "shared_store.processes": "shared_store.process.processes",
 }
-"""Names in the documentation before the modules moved into rooms."""
-keep_old_names(OLD_NAMES)
+"""Names in the documentation before the modules moved into rooms; and those that a running shim of before loads when its node ends."""
+OLD_MEMBERS = {"shared_store.policy_contract.differences": "shared_store.contract.policy_changes.differences"}
+keep_old_names(OLD_NAMES, OLD_MEMBERS)

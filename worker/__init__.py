@@ -6,6 +6,7 @@ OLD_NAMES = {
     "worker.learning.ppo.settings": "worker.settings.ppo",
     "worker.learning.rsl.settings": "worker.settings.rsl_rl",
     "worker.learning.sac.settings": "worker.settings.sac",
+    "worker.racer.rewards.kept": "worker.racer.rewards.reward_file",
     "worker.tasks.config": "worker.settings.task",
     "worker.tasks.configs": "worker.settings",
     "worker.tasks.configs.camera": "worker.settings.camera",
