@@ -5,11 +5,14 @@ from __future__ import annotations
 import json
 import signal
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import httpx
 import pytest
 import yaml
 
+from orchestrator.api.http.auth import cookie_name
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.layout import Store
 from shared_store.volume.metrics import read_metrics
@@ -26,6 +29,17 @@ pytestmark = pytest.mark.skipif(
 )
 SHORT, LONG = 200, 100_000
 """Iterations of the job that ends by itself and of the one that is stopped."""
+
+
+@dataclass(frozen=True)
+class Upgraded:
+    """Today's controller on the home."""
+
+    server: KeyServing
+    jobs: dict[str, str]
+    """By name. Their ranks stand still until a test has them go on."""
+    session: str
+    """Of a person who logged in to the older commit's console."""
 
 
 def submit(server: KeyServing, directory: Path, name: str, nodes: int, iterations: int) -> str:
@@ -48,8 +62,7 @@ def ranks_of(home: Path, job: str) -> list[Process]:
 
 
 @pytest.fixture(scope="module")
-def upgraded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[KeyServing, dict[str, str]]]:
-    """Today's controller on the home, and the jobs by name, whose ranks stand still until a test has them go on."""
+def upgraded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Upgraded]:
     base = tmp_path_factory.mktemp("upgrade")
     home = base / "home"
     home.mkdir(mode=0o700)
@@ -64,6 +77,7 @@ def upgraded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[KeyServ
         for name in ("goes-on", "stopped"):
             hold(former, jobs[name])
         before = {str(each) for each in gang_members(home)}
+        (session,) = httpx.post(f"{former.url}/login", data={"key": key}, trust_env=False).cookies.values()
         former.process.send_signal(signal.SIGTERM)
         former.process.wait(60 * PATIENCE)
     except BaseException:
@@ -71,12 +85,19 @@ def upgraded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[KeyServ
         raise
     with KeyServing(home, "--cpus", "4", key=key) as server:
         assert {str(each) for each in gang_members(home)} >= before, "the nodes ran on"
-        yield server, jobs
+        yield Upgraded(server, jobs, session)
 
 
-def test_a_training_of_the_older_commit_goes_on_to_its_end(upgraded: tuple[KeyServing, dict[str, str]]) -> None:
-    server, jobs = upgraded
-    job = jobs["goes-on"]
+def test_a_session_of_the_console_goes_on(upgraded: Upgraded) -> None:
+    url = httpx.URL(upgraded.server.url)
+    assert url.port is not None
+    cookies, browser = {cookie_name(url.port): upgraded.session}, {"Accept": "text/html"}
+    assert httpx.get(url, cookies=cookies, headers=browser, trust_env=False).status_code == 200
+    assert httpx.get(url, headers=browser, trust_env=False).headers["location"].startswith("/login")
+
+
+def test_a_training_of_the_older_commit_goes_on_to_its_end(upgraded: Upgraded) -> None:
+    server, job = upgraded.server, upgraded.jobs["goes-on"]
     assert server.detail(job)["status"] == "RUNNING"
     for rank in ranks_of(server.home, job):
         rank.strike(signal.SIGCONT)
@@ -89,10 +110,9 @@ def test_a_training_of_the_older_commit_goes_on_to_its_end(upgraded: tuple[KeySe
 
 
 def test_commands_reach_nodes_of_the_older_commit_and_their_run_is_resumed(
-    upgraded: tuple[KeyServing, dict[str, str]],
+    upgraded: Upgraded,
 ) -> None:
-    server, jobs = upgraded
-    job = jobs["stopped"]
+    server, job = upgraded.server, upgraded.jobs["stopped"]
     run = Store(server.home / "store").run(server.detail(job)["run"])
     (rank,) = ranks_of(server.home, job)
     rank.strike(signal.SIGCONT)
