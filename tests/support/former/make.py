@@ -27,7 +27,7 @@ from tests.support.definitions import container, multinode
 from tests.support.former.archive import ARCHIVE, FACTS, LIBRARIES, processor
 from tests.support.former.environment import COMMIT, make_environment
 from tests.support.former.serving import FormerServing, create_key
-from tests.support.former.specs import COMMAND, TRAINING
+from tests.support.former.specs import COMMAND, OTHERS, TRAINING
 from tests.support.orchestrator.receiver import SECRET
 from tests.support.processes import end_all, gang_members
 from tests.support.suite.caches import kernel_cache
@@ -100,7 +100,9 @@ def _run_to_the_end(server: FormerServing, base: Path) -> dict[str, str]:
             tags={"team": queue},
             **more,
         )
-    jobs = {"whole": _submit(server, base, TRAINING)}
+    jobs = {spec["name"]: _submit(server, base, spec) for spec in (TRAINING, *OTHERS)}
+    for spec in OTHERS:
+        _ended(server, jobs[spec["name"]])
     run = _ended(server, jobs["whole"])["run"]
     for words in (["evaluate", run, "--episodes", "4"], ["export", run], ["models", "register", run, "--name", "pole"]):
         done = server.muster(*words)

@@ -22,7 +22,7 @@ from shared_store.volume.metrics import read_metrics
 from tests.support.faults.checks import files_differing, without_timing
 from tests.support.former.archive import Archived, unpack
 from tests.support.former.serving import KeyServing
-from tests.support.former.specs import TRAINING
+from tests.support.former.specs import OTHERS, TRAINING
 from tests.support.orchestrator.receiver import Receiver, receiving, write_webhooks
 from tests.support.waiting import wait_for
 
@@ -90,28 +90,35 @@ def test_jobs_that_ran_or_waited_when_the_power_was_cut_go_on(
     assert all(json.loads(body)["data"]["queue"] == "robots" for _, body in receiver.messages)
 
 
+@pytest.mark.parametrize(
+    ("name", "middle", "later", "last"),
+    [("whole", 30, 40, LAST), *((spec["name"], 4, 8, spec["train"]["iterations"]) for spec in OTHERS)],
+)
 def test_a_run_resumed_from_its_middle_ends_with_the_same_bits(
-    archived: Archived, served: KeyServing, tmp_path: Path
+    archived: Archived, served: KeyServing, tmp_path: Path, name: str, middle: int, later: int, last: int
 ) -> None:
-    run = copy_of(archived, served, "whole")
-    before = {record["iteration"]: record for record in read_metrics(archived.run("whole"))}
-    resumed = succeeded(served, served.answer("resume", run.name, "--checkpoint", "30")["jobId"])
-    epoch = resumed["attempts"][-1]["epoch"]
-    there, differing = archived.run("whole"), archived.other_bits()
+    run, there, differing = copy_of(archived, served, name), archived.run(name), archived.other_bits()
+    epoch = resumed_epoch(served, run, middle)
     if differing is None:
-        straight = [checkpoint(there, iteration, 1) for iteration in (40, 50, LAST)]
-        again = [checkpoint(run, iteration, epoch) for iteration in (40, 50, LAST)]
+        pairs = [(checkpoint(there, each, 1), checkpoint(run, each, epoch)) for each in (later, last)]
+        before = {record["iteration"]: without_timing(record) for record in read_metrics(there)}
         for record in read_metrics(run):
-            old = without_timing(before[record["iteration"]])
+            old = before[record["iteration"]]
             assert {key: record.get(key) for key in old} == old
     else:
         warnings.warn(f"computed by today's code instead of the archive's: {differing}", stacklevel=1)
-        kept = tmp_path / "straight"
-        shutil.copytree(checkpoint(run, LAST, epoch).path, kept)
-        straight = [Checkpoint(kept, LAST, epoch)]
-        resumed = succeeded(served, served.answer("resume", run.name, "--checkpoint", "40")["jobId"])
-        again = [checkpoint(run, LAST, resumed["attempts"][-1]["epoch"])]
-    assert [files_differing(*pair) for pair in zip(straight, again, strict=True)] == [[]] * len(straight)
+        kept = tmp_path / f"{last:08}-e{epoch}"
+        shutil.copytree(checkpoint(run, last, epoch).path, kept)
+        pairs = [(Checkpoint(kept, last, epoch), checkpoint(run, last, resumed_epoch(served, run, later)))]
+    for straight, resumed in pairs:
+        assert not files_differing(straight, resumed)
+
+
+def resumed_epoch(served: KeyServing, run: Run, iteration: int) -> int:
+    """Resume the run from a checkpoint, to its end; returns the epoch of that."""
+    job = served.answer("resume", run.name, "--checkpoint", str(iteration))["jobId"]
+    epoch: int = succeeded(served, job)["attempts"][-1]["epoch"]
+    return epoch
 
 
 def test_the_same_training_begun_anew_computes_the_same_bits(
