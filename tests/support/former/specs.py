@@ -41,5 +41,6 @@ OTHERS = [
         },
     ),
     _small("ant", {"task": "Ant", "worlds": 4, "ppo": {"steps": 8, "hidden_sizes": [16, 16]}}),
+    _small("racer", {"task": "Racer", "worlds": 4, "ppo": {"steps": 8, "hidden_sizes": [16, 16]}}),
 ]
-"""Trainings with the other algorithms, and of a robot with contacts."""
+"""Trainings with the other algorithms, of a robot with contacts, and of the racer."""

@@ -10,6 +10,7 @@ import json
 import shutil
 import warnings
 from collections.abc import Iterator
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +98,8 @@ def test_jobs_that_ran_or_waited_when_the_power_was_cut_go_on(
 def test_a_run_resumed_from_its_middle_ends_with_the_same_bits(
     archived: Archived, served: KeyServing, tmp_path: Path, name: str, middle: int, later: int, last: int
 ) -> None:
+    if name == "racer" and "Racer" not in entry_points(group="muster.tasks").names:
+        pytest.skip("the racer is not installed: its old runs are untested")
     run, there, differing = copy_of(archived, served, name), archived.run(name), archived.other_bits()
     epoch = resumed_epoch(served, run, middle)
     if differing is None:
