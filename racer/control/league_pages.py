@@ -19,8 +19,8 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
-from racer.control import league_routes as api
-from racer.control.league_routes import LEAGUE_TAG, MODEL_TAG
+from racer.control import leagues as cases
+from racer.control.leagues import LEAGUE_TAG, MODEL_TAG
 from racer.control.submit_form import FORM
 from racer.control.track_pages import OUTLINE, track_names
 from racer.store.leagues import moment
@@ -44,7 +44,8 @@ def leagues(request: Request) -> Response:
     """All leagues, and a form for another one."""
     tracks, missing = track_names(request)
     found = [
-        {"name": each["name"], "problem": each.get("problem", ""), **_shown(each)} for each in api.list_leagues(request)
+        {"name": each["name"], "problem": each.get("problem", ""), **_shown(each)}
+        for each in cases.list_leagues(controller_of(request))
     ]
     return render(
         request, "leagues.html", leagues=found, tracks=tracks, no_tracks=missing, rankings=RANKINGS, outline=OUTLINE
@@ -54,24 +55,24 @@ def leagues(request: Request) -> Response:
 @router.post("/leagues")
 def create(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Create a league; its rules are never changed."""
-    given: dict[str, Any] = {key: form.one(key) for key in form.fields if key in api.CreateRequest.model_fields}
+    given: dict[str, Any] = {key: form.one(key) for key in form.fields if key in cases.CreateRequest.model_fields}
     given = {key: value.strip() for key, value in given.items() if value.strip()}
     given |= {key: _moment(key, given[key]) for key in ("opens", "closes") if key in given}
     given["track"] = [each.strip() for each in form.every("track") if each.strip()]
-    body = body_of(api.CreateRequest, {"name": "", **given})
-    league = api.create_league(request, body)
+    body = body_of(cases.CreateRequest, {"name": "", **given})
+    league = cases.create_league(controller_of(request), actor_of(request), body)
     return done(request, f"/leagues/{league['name']}", f"created league {league['name']}")
 
 
 @router.get("/leagues/{name}")
 def league(request: Request, name: str, every: bool = Query(default=False)) -> Response:
     """The rules, the table, and races that are not entered yet."""
-    found = api.read_league(request, name)
+    found = cases.read_league(controller_of(request), name)
     if "problem" in found:
         raise ClientError(found["problem"], 409)
     rows = [
         {**row, "time": clock(row["time"]), "best_lap": clock(row["best_lap"])}
-        for row in api.league_table(request, name, every)
+        for row in cases.league_table(controller_of(request), name, every=every)
     ]
     models = [
         f"{each['name']}@{each['version']}" for each in list_models(request) if FORM.includes(str(each.get("task")))
@@ -96,14 +97,14 @@ def race_stream(request: Request, name: str) -> Response:
     actor = actor_of(request)
     rows = Rows()
     look = partial(_races, request, name)
-    api.read_league(request, name)
+    cases.read_league(controller_of(request), name)
     return stream(request, lambda: rows.changes(_recent.get((actor, name), look), {}), _INTERVAL, stored=True)
 
 
 @router.post("/leagues/{name}/races")
 def race(request: Request, name: str, form: Form = Depends(sent_form)) -> Response:
     """Submit the race of a model."""
-    started = api.race(request, name, body_of(api.RaceRequest, _racer(form)), None)
+    started = cases.race(controller_of(request), actor_of(request), name, body_of(cases.RaceRequest, _racer(form)))
     reference = f"{started['model']}@{started['version']}"
     told = f"submitted the race of {reference} as {started['jobId'][:8]}; enter it here when it has ended"
     return done(request, f"/leagues/{name}", told)
@@ -112,14 +113,19 @@ def race(request: Request, name: str, form: Form = Depends(sent_form)) -> Respon
 @router.post("/leagues/{name}/entries")
 def enter(request: Request, name: str, form: Form = Depends(sent_form)) -> Response:
     """Make an entry of a race that has ended, for good."""
-    entry = api.enter(request, name, body_of(api.EnterRequest, {**_racer(form), "job": form.one("job")}))
+    entry = cases.enter(
+        controller_of(request),
+        actor_of(request),
+        name,
+        body_of(cases.EnterRequest, {**_racer(form), "job": form.one("job")}),
+    )
     return done(request, f"/leagues/{name}/entries/{entry['entry']}", f"entry {entry['entry']} of {name}")
 
 
 @router.get("/leagues/{name}/entries/{number}")
 def entry(request: Request, name: str, number: int) -> Response:
     """An entry with its laps, and whether it and its model are unchanged since."""
-    found = api.read_entry(request, name, number)
+    found = cases.read_entry(controller_of(request), actor_of(request), name, number)
     trials = [
         {**each, "time": clock(each.get("time")), "penalty": f"{each.get('penalty') or 0:g} s"}
         for each in (found.get("race") or {}).get("trials") or ()
@@ -150,10 +156,10 @@ def entry(request: Request, name: str, number: int) -> Response:
 @router.post("/leagues/{name}/entries/{number}/disqualify")
 def disqualify(request: Request, name: str, number: int, form: Form = Depends(sent_form)) -> Response:
     """Say for good that an entry does not count."""
-    body = body_of(api.DisqualifyRequest, {"reason": form.one("reason").strip()})
+    body = body_of(cases.DisqualifyRequest, {"reason": form.one("reason").strip()})
     text = f"The entry stays as it is, and the table says for good that it does not count: {body.reason}"
     form.confirm(Question(f"Disqualify entry {number} of {name}?", text, "Disqualify"))
-    api.disqualify(request, name, number, body)
+    cases.disqualify(controller_of(request), actor_of(request), name, number, body)
     return done(request, f"/leagues/{name}", f"entry {number} of {name} is disqualified")
 
 
@@ -219,7 +225,7 @@ def _races(request: Request, name: str) -> dict[str, dict[str, Any]]:
         return {}
     described = batch.call(controller, actor, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
     tags = {each["jobId"]: each.get("tags") or {} for each in described}
-    entered = api.entered_jobs(request, name)
+    entered = cases.entered_jobs(controller_of(request), name)
     ours = [job for job in jobs if tags.get(job["id"], {}).get(LEAGUE_TAG) == name and job["id"] not in entered]
     return {job["id"]: _race(job, str(tags[job["id"]].get(MODEL_TAG))) for job in ours[:_RACES]}
 

@@ -177,7 +177,6 @@ def watching() -> Iterator[set[tuple[str, int]]]:
 
 ALONE = {
     "export.py:main": "the main rank exports, and the others leave at once",
-    "race.py:<module>": "a race is refused on several ranks",
 }
 """Paths that a gang of one takes alone, and why."""
 TESTS = {

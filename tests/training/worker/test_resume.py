@@ -58,7 +58,7 @@ def test_worlds_are_the_same_however_they_are_dealt_out(name: str) -> None:
 
 
 def test_what_a_task_keeps_from_step_to_step_belongs_to_the_state() -> None:
-    task = make("Quadruped")
+    task = make(SETTINGS, "Quadruped")
     play(task, 20, seed=7)
     state = task.state_dict()
     assert state["memory"].shape == (8, 4) and state["last_actions"].any()
@@ -67,4 +67,4 @@ def test_what_a_task_keeps_from_step_to_step_belongs_to_the_state() -> None:
     assert not same(exact, play(task, 10, seed=8))
     task.load_state_dict(state)
     assert same(exact, play(task, 10, seed=8))
-    assert "memory" not in make("Cartpole", 2).state_dict(), "a task that keeps nothing saves nothing"
+    assert "memory" not in make(SETTINGS, "Cartpole", 2).state_dict(), "a task that keeps nothing saves nothing"

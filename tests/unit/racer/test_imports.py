@@ -14,7 +14,8 @@ import pytest
 from tests.conftest import REPOSITORY
 
 OTHERS = ("orchestrator", "worker", "shared_store")
-PUBLIC = set(re.findall(r"^\| `([a-z_.]+)` \|", (REPOSITORY / "docs" / "plug-ins.md").read_text(), re.MULTILINE))
+PAGE = (REPOSITORY / "docs" / "plug-ins.md").read_text()
+PUBLIC = set(re.findall(rf"^\| `((?:{'|'.join(OTHERS)})\.[a-z_.]+)` \|", PAGE, re.MULTILINE))
 """The modules in the tables of the page."""
 WORKER_BY_THE_CONTROLLER = "worker.settings"
 HEAVY = {"torch", "warp", "newton"}
