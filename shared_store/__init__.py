@@ -22,8 +22,8 @@ __version__ = "0.1.0"
 class _OldNames:
     """Finder and loader of modules under the names that they had before they moved."""
 
-    def __init__(self, names: Mapping[str, str]) -> None:
-        self._names = names
+    def __init__(self, names: Mapping[str, str], members: Mapping[str, str]) -> None:
+        self._names, self._members = names, members
         self._specs: dict[str, ModuleSpec | None] = {}
 
     def _new(self, name: str) -> str | None:
@@ -59,9 +59,14 @@ class _OldNames:
         return module
 
     def exec_module(self, module: ModuleType) -> None:
-        """The module has run already; it keeps its own spec, which the import has just replaced."""
+        """The module has run already; it keeps its own spec, which the import has just replaced, and gets the members that left it."""
         assert module.__spec__ is not None
-        module.__spec__ = self._specs[module.__spec__.name]
+        old = module.__spec__.name
+        module.__spec__ = self._specs[old]
+        for member, new in self._members.items():
+            if member.rpartition(".")[0] == old:
+                home, _, name = new.rpartition(".")
+                setattr(module, member.rpartition(".")[2], getattr(import_module(home), name))
 
     def get_code(self, name: str) -> CodeType | None:
         """For ``python -m`` with an old name."""
@@ -71,20 +76,23 @@ class _OldNames:
         return code
 
 
-def keep_old_names(names: Mapping[str, str]) -> None:
+def keep_old_names(names: Mapping[str, str], members: Mapping[str, str] | None = None) -> None:
     """Let modules be imported, and run with ``python -m``, by their old names, too, since tasks, engines and jobs of others hold these.
 
     Args:
         names: Old name → new name. A package stands for all of its modules that are not named themselves.
+        members: The same of members that moved out of a module of ``names``, with the names of the modules in front.
     """
-    sys.meta_path.insert(0, _OldNames(names))
+    sys.meta_path.insert(0, _OldNames(names, members or {}))
 
 
 OLD_NAMES = {
+    "shared_store.cgroups": "shared_store.process.cgroups",
     "shared_store.checkpoints": "shared_store.volume.checkpoints",
     "shared_store.file_fields": "shared_store.contract.file_fields",
     "shared_store.layout": "shared_store.volume.layout",
     "shared_store.leagues": "racer.store.leagues",
+    "shared_store.nodes": "shared_store.process.node_processes",
     "shared_store.policy_contract": "shared_store.contract.policy",
     "shared_store.ports": "shared_store.process.ports",
     "shared_store.processes": "shared_store.process.processes",
@@ -92,5 +100,6 @@ OLD_NAMES = {
     "shared_store.standings": "racer.store.standings",
     "shared_store.tracks": "racer.store.tracks",
 }
-"""Names in the documentation before the modules moved into rooms."""
-keep_old_names(OLD_NAMES)
+"""Names in the documentation before the modules moved into rooms; and those that a running shim of before loads when its node ends."""
+OLD_MEMBERS = {"shared_store.policy_contract.differences": "shared_store.contract.policy_changes.differences"}
+keep_old_names(OLD_NAMES, OLD_MEMBERS)

@@ -7,6 +7,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 from orchestrator.engines.api import Engine, EngineError, EngineType, Option, Setting, Traits
+from orchestrator.engines.toolkit.looks import observing_several
 from shared_store.contract.error_text import nearest
 
 GROUP = "muster.engines"
@@ -59,7 +60,7 @@ def traits_of(name: str) -> Traits:
 
 def make_engine(name: str, setting: Setting) -> Engine:
     """The engine called ``name``. Raises EngineError: there is none, it is not installed, or it does not answer; one line with what to do."""
-    return engine_type(name).make(setting)
+    return observing_several(engine_type(name).make(setting))
 
 
 def check_tags(tags: Mapping[str, str], engines: Iterable[str], *, of_a_queue: bool = False) -> None:

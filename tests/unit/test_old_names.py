@@ -1,21 +1,31 @@
-"""Modules that moved can be imported by their old names, too."""
+"""Modules that moved can be imported by their old names, too, with everything in them that a page ever named."""
 
 from __future__ import annotations
 
 import re
 import sys
 from importlib import import_module
+from importlib.util import find_spec
+from typing import Any
 
 import pytest
 
 import shared_store
 import worker
 from tests.conftest import REPOSITORY
+from tests.support.pages import repository_files
 
 NAMES = {
     **{old: new for old, new in (shared_store.OLD_NAMES | worker.OLD_NAMES).items() if not new.startswith("racer.")},
     "worker.tasks.configs.camera": "worker.settings.camera",
 }
+DOCUMENTED = [
+    name
+    for name in (REPOSITORY / "tests" / "data" / "former" / "names.txt").read_text().split()
+    if find_spec("racer") or not name.startswith("worker.racer")
+]
+"""What pages named before modules moved: modules, and their members behind a colon or a dot."""
+IMPORT = re.compile(r"^from ((?:orchestrator|racer|shared_store|worker)[\w.]*) import (\([^)]*\)|.+)$", re.MULTILINE)
 
 
 @pytest.mark.parametrize(("old", "new"), NAMES.items())
@@ -29,7 +39,7 @@ def test_what_moved_out_of_what_is_installed_is_not_found_by_its_old_name(monkey
     """As without the racer: the error names what was asked for."""
     from shared_store import _OldNames
 
-    monkeypatch.setattr(sys, "meta_path", [_OldNames({"worker.gone": "nowhere.gone"}), *sys.meta_path])
+    monkeypatch.setattr(sys, "meta_path", [_OldNames({"worker.gone": "nowhere.gone"}, {}), *sys.meta_path])
     with pytest.raises(ModuleNotFoundError, match=r"^No module named 'worker\.gone'$"):
         import_module("worker.gone")
     with pytest.raises(ModuleNotFoundError, match=r"^No module named 'worker\.tasks\.configs\.nothing'$"):
@@ -44,3 +54,29 @@ def test_the_page_of_moved_modules_names_modules_that_are_there_and_marks_the_ke
         place = REPOSITORY / new.replace(".", "/")
         assert place.with_suffix(".py").is_file() or place.is_dir() or new.startswith("racer."), (old, new)
     assert {old for old, kept, _ in rows if kept} == {*shared_store.OLD_NAMES, *worker.OLD_NAMES}
+
+
+def find(name: str) -> Any:
+    """What a dotted name means. Raises ImportError, AttributeError."""
+    module, _, rest = name.replace(":", ".").rpartition(".")
+    try:
+        return import_module(f"{module}.{rest}" if module else rest)
+    except ModuleNotFoundError:
+        return getattr(find(module), rest)
+
+
+@pytest.mark.parametrize("name", DOCUMENTED)
+def test_what_a_page_once_named_is_there(name: str) -> None:
+    assert find(name) is not None
+
+
+def test_what_the_pages_import_today_is_there() -> None:
+    named = {
+        f"{module}:{name}"
+        for page in repository_files("*.md")
+        for module, names in IMPORT.findall((REPOSITORY / page).read_text())
+        for name in re.findall(r"(\w+)(?: as \w+)?", re.sub(r"#.*", "", names))
+    }
+    assert len(named) > 50
+    for name in named:
+        assert find(name) is not None, name

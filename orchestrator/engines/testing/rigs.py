@@ -11,6 +11,7 @@ from typing import Any, Protocol, Self
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus
 from orchestrator.engines.testing.fake import FakeCluster, FakeEngine
+from orchestrator.engines.toolkit.looks import observing_several
 from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.files import write_atomic
 from shared_store.volume.layout import Store
@@ -85,7 +86,7 @@ class ShellRig:
         self.engine = self.new_engine()
 
     def new_engine(self) -> Engine:
-        return self._make()
+        return observing_several(self._make())
 
     def gang(self, name: str, nodes: int) -> Gang:
         job = f"{self._suite}-{name}"

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from inspect import signature
+from typing import Any
 
 from orchestrator.engines.api import Engine, GangStatus, Handle, Look
 
@@ -10,6 +13,17 @@ from orchestrator.engines.api import Engine, GangStatus, Handle, Look
 def one_by_one(look: Callable[[Handle], GangStatus], handles: Sequence[Handle]) -> list[Look]:
     """:meth:`Engine.observe` of an engine that looks at one gang at a time."""
     return [_tried(look, handle) for handle in handles]
+
+
+def observing_several(engine: Engine) -> Engine:
+    """The engine, with an ``observe`` that takes several handles.
+
+    Engines of others may be older than that: one whose ``observe(handle)`` takes a single handle is asked for one gang at a time.
+    """
+    if "handle" in signature(engine.observe).parameters:
+        single: Any = engine.observe
+        engine.observe = partial(one_by_one, single)  # type: ignore[method-assign]
+    return engine
 
 
 def status_of(engine: Engine, handle: Handle) -> GangStatus:

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.epoch import read_epoch
 from shared_store.volume.files import read_json
 from shared_store.volume.layout import Run
@@ -46,7 +46,7 @@ class Reference:
 
     def __init__(self, run: Run) -> None:
         self.checkpoints = {checkpoint.iteration: checkpoint for checkpoint in list_checkpoints(run)}
-        self.records = {record["iteration"]: _without_timing(record) for record in read_metrics(run)}
+        self.records = {record["iteration"]: without_timing(record) for record in read_metrics(run)}
         self.last = max(self.records)
         self.evaluation = _evaluation(run, self.checkpoints[self.last].name)
 
@@ -118,13 +118,8 @@ def _check_checkpoints(run: Run, reference: Reference, verdict: Verdict) -> None
         for key in _MANIFEST:
             if checkpoint.manifest.get(key) != straight.manifest.get(key):
                 say(f"checkpoint {checkpoint.name}: manifest.json: {key} differs")
-        for name in sorted(straight.manifest["files"]):
-            if name not in checkpoint.manifest["files"]:
-                say(f"checkpoint {checkpoint.name}: {name} is missing")
-                continue
-            differ = differences(_load(straight.path / name), _load(checkpoint.path / name), name)
-            if differ:
-                say(f"checkpoint {checkpoint.name} differs in {len(differ)} values: {', '.join(differ[:5])}")
+        if differ := files_differing(straight, checkpoint):
+            say(f"checkpoint {checkpoint.name} differs in {len(differ)} values: {', '.join(differ[:5])}")
     evaluation = _evaluation(run, found[-1].name) if found else {}
     if evaluation != reference.evaluation:
         say(f"the evaluation is {evaluation}, not {reference.evaluation}")
@@ -159,7 +154,7 @@ def _check_history(run: Run, reference: Reference, verdict: Verdict) -> None:
 def _compare_records(path: Path, records: list[dict[str, Any]], reference: Reference, verdict: Verdict) -> None:
     fields, iterations = set[str](), []
     for record in records:
-        straight, struck = reference.records.get(record["iteration"], {}), _without_timing(record)
+        straight, struck = reference.records.get(record["iteration"], {}), without_timing(record)
         if differ := {key for key in straight.keys() | struck.keys() if straight.get(key) != struck.get(key)}:
             fields |= differ
             iterations.append(record["iteration"])
@@ -187,6 +182,17 @@ def _check_logs(home: Home, run: Run, verdict: Verdict) -> None:
     errors = home.errors.read_text(errors="replace") if home.errors.exists() else ""
     if "Traceback" in errors:
         verdict.violations.append(f"a controller had an exception: see {home.errors}")
+
+
+def files_differing(straight: Checkpoint, other: Checkpoint) -> list[str]:
+    """Paths of the values of ``straight``'s files that are not the same bits in ``other``."""
+    found = []
+    for name in sorted(straight.manifest["files"]):
+        if name in other.manifest["files"]:
+            found += differences(_load(straight.path / name), _load(other.path / name), name)
+        else:
+            found.append(f"{name} (missing)")
+    return found
 
 
 def differences(a: Any, b: Any, where: str) -> list[str]:
@@ -217,7 +223,8 @@ def _load(path: Path) -> Any:
     return torch.load(path, map_location="cpu", weights_only=True)
 
 
-def _without_timing(record: dict[str, Any]) -> dict[str, Any]:
+def without_timing(record: dict[str, Any]) -> dict[str, Any]:
+    """What the training computed in an iteration, without how long that took."""
     return {key: value for key, value in record.items() if not key.endswith(_TIMING)}
 
 
