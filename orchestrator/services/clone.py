@@ -24,9 +24,9 @@ from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
 from orchestrator.services.context import Context, Known, release, using, with_store
 from orchestrator.services.permissions import Actor
-from orchestrator.services.runs import inherited, spec_of
+from orchestrator.services.runs import spec_of
 from orchestrator.services.sources import with_teacher
-from orchestrator.services.spec_submission import Changes, answered, check, submit
+from orchestrator.services.spec_submission import Changes, answered, check, inherited, submit
 from orchestrator.services.texts import keep_again
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate

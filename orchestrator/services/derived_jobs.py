@@ -10,8 +10,8 @@ from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.persistence.models import Job
 from orchestrator.services.permissions import Actor
-from orchestrator.services.runs import inherited, spec_of
-from orchestrator.services.spec_submission import submit_spec
+from orchestrator.services.runs import spec_of
+from orchestrator.services.spec_submission import inherited, submit_spec
 from orchestrator.spec.evaluations import document_beside, evaluation_document
 from orchestrator.spec.model import validate
 from shared_store.volume.layout import Run

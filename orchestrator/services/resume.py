@@ -19,9 +19,9 @@ from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
 from orchestrator.services.context import Context, Known, archived, using, with_store
 from orchestrator.services.permissions import Actor
-from orchestrator.services.runs import inherited, newest_job, spec_of
+from orchestrator.services.runs import newest_job, spec_of
 from orchestrator.services.sources import with_teacher
-from orchestrator.services.spec_submission import Changes, answered, submit
+from orchestrator.services.spec_submission import Changes, answered, inherited, submit
 from orchestrator.services.texts import keep_again
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate

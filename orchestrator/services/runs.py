@@ -137,17 +137,6 @@ def spec_of(session: Session, actor: Actor, run: FoundRun) -> Mapping[str, Any] 
     return (run.description() or {}).get("spec")
 
 
-def inherited(actor: Actor, spec: Mapping[str, Any]) -> dict[str, Any]:
-    """What a job of this actor has of a run's spec: all but another's share, in place of which it has that of the actor's key."""
-    if actor.share is None:
-        return dict(spec)
-    kept = {key: value for key, value in spec.items() if key != "share" or value == actor.share}
-    evaluation = kept.get("evaluation")
-    if isinstance(evaluation, Mapping) and evaluation.get("share") not in (None, actor.share):
-        kept["evaluation"] = {**evaluation, "share": None}
-    return kept
-
-
 def _shown_spec(session: Session, actor: Actor, run: FoundRun, created: Any) -> Any:
     """:func:`spec_of`; that with which the run was ``created`` where the row of its newest job is damaged."""
     try:

@@ -55,6 +55,17 @@ class Changes:
         return [*self.assignments, f"nodes={self.nodes}"]
 
 
+def inherited(actor: Actor, spec: Mapping[str, Any]) -> dict[str, Any]:
+    """What a job of this actor has of a run's spec: all but another's share, in place of which it has that of the actor's key."""
+    if actor.share is None:
+        return dict(spec)
+    kept = {key: value for key, value in spec.items() if key != "share" or value == actor.share}
+    evaluation = kept.get("evaluation")
+    if isinstance(evaluation, Mapping) and evaluation.get("share") not in (None, actor.share):
+        kept["evaluation"] = {**evaluation, "share": None}
+    return kept
+
+
 def answered(context: Context, run: str) -> Job | None:
     """The job that an earlier call with the same idempotency key has submitted. Raises ClientError where that was for another run."""
     job = submission.answered(context)

@@ -23,8 +23,7 @@ from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, using, with_store
 from orchestrator.services.models import any_model, find_model, owner_of_model
 from orchestrator.services.permissions import CONTROLLER, Actor, Owned
-from orchestrator.services.runs import inherited
-from orchestrator.services.spec_submission import submit
+from orchestrator.services.spec_submission import inherited, submit
 from orchestrator.spec.settings import task_config
 from racer.control import operations
 from racer.control.league_races import race_job

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from orchestrator.services.permissions import Actor
-from orchestrator.services.runs import inherited
+from orchestrator.services.spec_submission import inherited
 
 SPEC: dict[str, Any] = {
     "queue": "fair",
