@@ -40,7 +40,7 @@ from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import Outcome, write_outcome
+from shared_store.volume.node_outcomes import Outcome, write_outcome
 
 E = TypeVar("E", bound=Engine)
 

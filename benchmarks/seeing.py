@@ -95,11 +95,11 @@ def watched(loop: Loop) -> list[int]:
         worlds = ("--worlds", str(TAPPED))
         made, said = folder / "live.mcap", folder / "said.txt"
         output = ("--episodes", "1000000", "--output", str(made))
-        recorded = ("worker.telemetry.live", str(run.path), *worlds, *output)
+        recorded = ("worker.telemetry.live_recording", str(run.path), *worlds, *output)
         attended((folder / "live.mcap.partial").exists, said, *recorded)
         mark(STRETCH)
         if find_spec("rerun"):
-            viewed = ("worker.telemetry.view", "--training", str(run.path), "--job", "bench", *worlds)
+            viewed = ("worker.telemetry.live_view", "--training", str(run.path), "--job", "bench", *worlds)
             attended(lambda: "http://" in said.read_text(), said, *viewed)
 
     with tempfile.TemporaryDirectory() as folder:

@@ -30,11 +30,11 @@ from benchmarks.training import build
 from shared_store.volume.layout import Run
 from tests.support.browser import empty_page
 from worker.telemetry import screen
+from worker.telemetry.live_view import Training
 from worker.telemetry.page import Page
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Rows
 from worker.telemetry.tap import Tap
-from worker.telemetry.view import Training
 
 WARM = 20.0
 """Seconds for the page to start and draw its first frames."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from shared_store.contract import plugins
-from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.node_outcomes import EX_TEMPFAIL
 from shared_store.volume.run_settings import merged
 from shared_store.volume.texts import beside, keep
 from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors

@@ -1,6 +1,6 @@
 """Sends a run's metrics to a tracking service: a process of its own beside the main rank, which follows what the run's files say.
 
-``python -m worker.track`` is started by :class:`worker.telemetry.tracking.Tracking` for each service that the job names. It reads one
+``python -m worker.track`` is started by :class:`worker.telemetry.tracking_processes.Tracking` for each service that the job names. It reads one
 JSON order on standard input, later how the training ended; its lines on standard output, JSON too, are for the log. Whatever a service
 does, the training neither waits nor fails: the metrics are in the store, and are sent once the service takes them.
 

@@ -147,7 +147,16 @@ def show(request: Request, reference: str) -> Response:
     if find_spec("newton") is None:
         raise ClientError("the live view needs the simulation on this machine: pip install 'muster[worker]'", CONFLICT)
     run = permitted_run(controller_of(request), actor_of(request), detail["run"], Operation.READ_RUN)
-    command = [sys.executable, "-P", "-m", "worker.telemetry.view", "--training", str(run.path), "--job", detail["id"]]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "worker.telemetry.live_view",
+        "--training",
+        str(run.path),
+        "--job",
+        detail["id"],
+    ]
     views.start(detail["id"], [*command, "--port", "0", "--framed-by", _origin(request)])
     return done(request, f"/jobs/{detail['id']}", "the live view starts")
 

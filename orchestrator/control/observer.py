@@ -10,14 +10,14 @@ from functools import partial
 from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
-from orchestrator.control.endings import node_end
+from orchestrator.control.node_ends import node_end
 from orchestrator.control.run_store import Errands, Key, Progress, RunStore
 from orchestrator.domain.attempt_events import Observed, Silence
 from orchestrator.domain.job import NodeEnd, aws_ending
 from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.models import Attempt, Job, Node, now
-from shared_store.volume.outcomes import Outcome
+from shared_store.volume.node_outcomes import Outcome
 
 CHECK_INTERVAL = 5.0
 """Seconds between two looks at a gang of which a node can't be seen or heard, or whose cause is not known yet."""

@@ -24,13 +24,13 @@ from sqlalchemy.orm import Session
 from orchestrator import machine
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention_looks import CONTROLLER, Look, Place, Step, Totals, Whose
+from orchestrator.control.run_facts import StoredRuns
 from orchestrator.control.run_users import RunUsers
-from orchestrator.control.stored_runs import StoredRuns
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.retention import JobFacts, References, Rules, RunFacts, decide, still_needed
-from orchestrator.persistence import references as rows
+from orchestrator.persistence import retention_rows as rows
 from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database

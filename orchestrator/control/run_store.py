@@ -25,7 +25,7 @@ from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.volume.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run, Store, StoreError
-from shared_store.volume.outcomes import Outcome, read_outcome
+from shared_store.volume.node_outcomes import Outcome, read_outcome
 from shared_store.volume.texts import Reference, keep, read_either
 
 log = logging.getLogger("muster.controller")

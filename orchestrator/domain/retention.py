@@ -1,7 +1,7 @@
 """The retention of old jobs and runs: what may go, what is still needed, and why. Pure decisions over facts.
 
 :func:`still_needed` is the one place that knows for what a run is kept. A new kind of thing that needs runs adds
-:class:`Reference` values where they are collected (:mod:`shared_store.volume.references`, :mod:`orchestrator.persistence.references`);
+:class:`Reference` values where they are collected (:mod:`shared_store.volume.references`, :mod:`orchestrator.persistence.retention_rows`);
 nothing changes here.
 """
 

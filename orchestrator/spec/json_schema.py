@@ -9,7 +9,7 @@ from pydantic import PydanticUserError, TypeAdapter
 from orchestrator.domain.gang import MOST_NODES
 from orchestrator.spec.model import ALGORITHMS, Spec
 from orchestrator.spec.settings import task_config
-from orchestrator.spec.track import track_schema
+from orchestrator.spec.tracking_services import track_schema
 from orchestrator.spec.values import known_tasks
 from shared_store.contract.policy import Contract
 

@@ -37,7 +37,7 @@ from orchestrator.spec.sections import (
     Share,
 )
 from orchestrator.spec.settings import effective_problem, section_of, settings_classes, task_config, train_section
-from orchestrator.spec.track import Track, key_in
+from orchestrator.spec.tracking_services import Track, key_in
 from orchestrator.spec.values import (
     Argument,
     Duration,

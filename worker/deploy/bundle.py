@@ -41,7 +41,7 @@ from shared_store.volume.files import remove_tree, write_json
 from shared_store.volume.layout import Run
 from worker.deploy import parity, rollouts
 from worker.deploy.leapp_description import LEAPP, leapp_description
-from worker.deploy.model import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
+from worker.deploy.model_file import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
 from worker.deploy.robots import add_robot
 from worker.tasks.run.declared import DeclaredTask
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase
 from shared_store.volume.checkpoints import Checkpoint
-from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.node_outcomes import EX_TEMPFAIL
 from worker.learning.adoption import adopt
 from worker.learning.algorithm import Algorithm, Share
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
@@ -22,7 +22,7 @@ from worker.learning.distributed import Gang
 from worker.learning.earlier_settings import as_begun
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.failures import Failures
-from worker.learning.faults import die, kill_at
+from worker.learning.fault_injection import die, kill_at
 from worker.learning.hooks import Hook
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup, user_errors

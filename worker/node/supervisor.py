@@ -29,12 +29,12 @@ from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run, Store, StoreError
 from shared_store.volume.log_files import LogWriter, left_out
 from shared_store.volume.logs import END_LINE, format_line, format_lines
-from shared_store.volume.outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
+from shared_store.volume.node_outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
 from worker.node.bus import Command, NodeBus
 from worker.node.memory import MemoryLimit
 from worker.node.network import interface_of
-from worker.node.processes import adopt_orphans, kill_group
 from worker.node.rank import Rank
+from worker.node.rank_processes import adopt_orphans, kill_group
 from worker.node.stacks import dump_stacks, state_of
 from worker.node.surroundings import Surroundings
 

@@ -124,7 +124,7 @@ class Rollout:
 
     def attachments(self) -> dict[str, bytes]:
         """The policy's contract, the policy as ONNX where its algorithm can export it, and the job that trained it."""
-        from worker.deploy.model import metadata_of, to_onnx
+        from worker.deploy.model_file import metadata_of, to_onnx
         from worker.tasks.run.policy_contract import policy_contract
 
         name, files = self.checkpoint.manifest["task"], {}

@@ -14,8 +14,8 @@ from typing import Any
 
 from orchestrator.api.http.answer_streams import MEMORY_PIECE, looked, pause
 from orchestrator.api.logs import eventstream
-from orchestrator.api.logs.events import Event, is_event, milliseconds
 from orchestrator.api.logs.filter import Matcher
+from orchestrator.api.logs.log_events import Event, is_event, milliseconds
 from orchestrator.api.logs.streams import Stream, newest_streams
 from orchestrator.control.controller import Controller
 from orchestrator.control.log_hub import Waker

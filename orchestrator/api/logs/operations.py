@@ -27,8 +27,8 @@ from orchestrator.api.http.limits import check_size
 from orchestrator.api.logs import filter as log_filter
 from orchestrator.api.logs import groups
 from orchestrator.api.logs.errors import JSON, LogsError, absent, invalid
-from orchestrator.api.logs.events import Event, event_id, first_and_last
 from orchestrator.api.logs.live_tail import LiveTail, messages
+from orchestrator.api.logs.log_events import Event, event_id, first_and_last
 from orchestrator.api.logs.streams import Stream, created_streams, find_stream, newest_streams
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import RequestError, Unavailable

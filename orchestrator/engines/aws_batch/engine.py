@@ -49,7 +49,7 @@ from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
 from shared_store.contract.error_text import counted
-from shared_store.volume.outcomes import EX_TEMPFAIL, Outcome
+from shared_store.volume.node_outcomes import EX_TEMPFAIL, Outcome
 
 _PORT = 29500
 _GRACE = 25.0

@@ -18,7 +18,7 @@ from botocore.parsers import ResponseParserError
 from orchestrator.engines.toolkit.log_copy import LogCopy
 from shared_store.volume.files import DamagedFile, json_object
 from shared_store.volume.logs import OUTCOME_LINE, format_line, parse_line
-from shared_store.volume.outcomes import Outcome, parse_outcome
+from shared_store.volume.node_outcomes import Outcome, parse_outcome
 
 _PACE = 0.05
 """Seconds between two requests: CloudWatch answers 25 a second for the whole account."""

@@ -60,7 +60,7 @@ class Watch:
             self._process.kill()
 
     def _listen(self) -> None:
-        command = [sys.executable, "-P", "-m", "orchestrator.engines.ray.watch", self.head]
+        command = [sys.executable, "-P", "-m", "orchestrator.engines.ray.cluster_watch", self.head]
         while not self._closing.is_set():
             self._process = subprocess.Popen(
                 command,

@@ -38,9 +38,9 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.ray import TRAITS
-from orchestrator.engines.ray.bundles import in_words
 from orchestrator.engines.ray.cluster import Watch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray.folder import LEASE, NEW, UNSTARTED, Folder
+from orchestrator.engines.ray.placement_groups import in_words
 from orchestrator.engines.ray.request import GangRequest, NodeRequest
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.looks import one_by_one

@@ -40,7 +40,8 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.slurm import TRAITS
-from orchestrator.engines.slurm.commands import (
+from orchestrator.engines.slurm.script import Submission, shown, submission_for
+from orchestrator.engines.slurm.slurm_commands import (
     SlurmJob,
     Unreachable,
     address_of_this_machine,
@@ -48,7 +49,6 @@ from orchestrator.engines.slurm.commands import (
     list_hosts,
     list_jobs,
 )
-from orchestrator.engines.slurm.script import Submission, shown, submission_for
 from orchestrator.engines.slurm.states import CANCELLED, OVER, QUEUED, ending, waiting
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.looks import one_by_one
@@ -56,7 +56,7 @@ from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import OUT_OF_MEMORY, Outcome
+from shared_store.volume.node_outcomes import OUT_OF_MEMORY, Outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """Errors of sbatch after which it would accept the job later."""

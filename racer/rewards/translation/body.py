@@ -7,9 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from racer.rewards.translation.calls import Calls
-from racer.rewards.translation.prelude import NO_RESULT
-from racer.rewards.translation.program import Program
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     Constant,
     Group,
@@ -24,6 +22,8 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.prelude import NO_RESULT
+from racer.rewards.translation.program import Program
 
 _MOST_PASSES = 16
 _DEEPEST = 20

@@ -8,11 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME
-from racer.rewards.translation.expressions import Expressions
-from racer.rewards.translation.items import Iterated
-from racer.rewards.translation.mathematics import FUNCTIONS, QUIET
-from racer.rewards.translation.prelude import EMPTY
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     LONGEST_GROUP,
     Constant,
@@ -32,6 +28,10 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.expressions import Expressions
+from racer.rewards.translation.items import Iterated
+from racer.rewards.translation.mathematics import FUNCTIONS, QUIET
+from racer.rewards.translation.prelude import EMPTY
 from shared_store.contract.error_text import counted
 
 _FOLDS = {"sum": "start", "min": "default", "max": "default", "any": None, "all": None, "len": None}

@@ -8,10 +8,7 @@ from functools import partial
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME
-from racer.rewards.translation.items import Items
-from racer.rewards.translation.prelude import KEY
-from racer.rewards.translation.program import CONSTANTS, MODULES, folded
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     LONGEST_GROUP,
     ORDER,
@@ -32,6 +29,9 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.items import Items
+from racer.rewards.translation.prelude import KEY
+from racer.rewards.translation.program import CONSTANTS, MODULES, folded
 
 _COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _WHOLE = {ast.Add: "py_iadd", ast.Sub: "py_isub", ast.Mult: "py_imul", ast.FloorDiv: "py_idiv", ast.Mod: "py_imod"}

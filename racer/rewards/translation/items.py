@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from racer.rewards.parameters import BY_NAME
 from racer.rewards.translation.emitter import Emitting
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     Constant,
     Group,

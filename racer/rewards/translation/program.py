@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME, NUMBER_COLUMNS, OBJECT_COLUMNS, OBJECT_COUNT
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     LONGEST_GROUP,
     Constant,

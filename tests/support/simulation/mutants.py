@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 from unittest import mock
 
-from orchestrator.control import attempts, endings
+from orchestrator.control import attempts, node_ends
 from orchestrator.control.observer import Observer
 from orchestrator.control.presence import Presence
 from orchestrator.control.run_store import Errands, RunStore
@@ -121,13 +121,13 @@ def any_volume_is_the_store() -> Mutant:
 
 def without_an_outcome_is_killed() -> Mutant:
     """T2: a node that ended with 0 and could not write its outcome counts as killed."""
-    seen_end = endings.seen_end
+    seen_end = node_ends.seen_end
 
     def seen(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
         end = seen_end(node, is_native, moment)
         return replace(end, exit_code=end.exit_code or 137) if node.cause is Cause.EXIT else end
 
-    return mock.patch.object(endings, "seen_end", seen)
+    return mock.patch.object(node_ends, "seen_end", seen)
 
 
 def a_fault_is_forgotten() -> Mutant:

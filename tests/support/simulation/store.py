@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from orchestrator.control.run_store import Progress, RunFacts, RunStore
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import Outcome
+from shared_store.volume.node_outcomes import Outcome
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation

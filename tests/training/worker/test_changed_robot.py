@@ -21,7 +21,7 @@ from tests.support.worker.ranks import placement, training
 from tests.support.worker.runs import runner, train
 from worker import export, repeat_incident
 from worker.settings.errors import TrainingError, UserError
-from worker.telemetry.view import Policy
+from worker.telemetry.live_view import Policy
 
 CHANGE = (
     "robot: mass [kg] 1.1 became 1.3; body pole: mass 0.1 became 0.3; "

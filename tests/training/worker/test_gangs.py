@@ -253,7 +253,7 @@ def worlds_that_do_not_fit_are_refused_by_all_ranks(gang: Gang, store: Path) -> 
 
     env = training(store, run="large", worlds=10**6)
     with given(gang, env), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("worker.learning.memory.free_bytes", lambda _: 10**6)
+        patch.setattr("worker.learning.memory_estimate.free_bytes", lambda _: 10**6)
         train.main()
 
 
@@ -264,11 +264,11 @@ def test_worlds_that_do_not_fit_are_refused_by_all_ranks(told: list[Any]) -> Non
 
 @case
 def worlds_that_turn_out_not_to_fit_are_measured_by_all_ranks(gang: Gang, store: Path) -> Any:
-    from worker.learning import memory
+    from worker.learning import memory_estimate
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "free_bytes", lambda _: 10**6)
-        with memory.within_memory(Point, PointConfig(), (PPO, PointPPO()), 4, gang):  # type: ignore[arg-type]
+        patch.setattr(memory_estimate, "free_bytes", lambda _: 10**6)
+        with memory_estimate.within_memory(Point, PointConfig(), (PPO, PointPPO()), 4, gang):  # type: ignore[arg-type]
             raise MemoryError
 
 

@@ -20,12 +20,12 @@ from shared_store.volume.layout import Run
 from worker.learning.reporter import Gate
 from worker.settings.overrides import configured
 from worker.tasks.library.cartpole_pixels import CartpolePixels
-from worker.telemetry.live import record
+from worker.telemetry.live_recording import record
 from worker.telemetry.live_tap import Attending
+from worker.telemetry.live_view import Training
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
 from worker.telemetry.tap import Reading, Tap
-from worker.telemetry.view import Training
 
 torch.set_num_threads(1)
 CONFIG = {"episode_seconds": 0.2, "camera": {"width": 12, "height": 8}}

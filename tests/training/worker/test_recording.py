@@ -26,7 +26,7 @@ from tests.support.worker.in_process import call_worker
 from worker.settings.cartpole import CartpoleConfig
 from worker.settings.errors import UserError
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.live import main
+from worker.telemetry.live_recording import main
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
 from worker.telemetry.rows import Rows

@@ -16,7 +16,7 @@ from racer.tracks.circuit import GAP, bounds, side_by_side
 from racer.tracks.generator import make_random
 from racer.tracks.geometry import advance, degrees, on_road, place_at, project
 from racer.tracks.presets import make_preset
-from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
+from racer.tracks.race_track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 from tests.support.racer.racing import open_track
 
 

@@ -21,7 +21,7 @@ from racer.tracks.circuit import circuit_of
 from racer.tracks.geometry import on_road, project
 from racer.tracks.naming import keep, resolve
 from racer.tracks.presets import make_preset
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 from shared_store.volume.layout import Store
 from tests.support.racer.racing import OVAL, open_track, racer
 from tests.support.refusals import refusal

@@ -26,7 +26,7 @@ from tests.support.worker.sac import make, point
 from worker.deploy import bundle
 from worker.deploy.bundle import Files, _publish, bundle_files
 from worker.deploy.leapp_description import leapp_description
-from worker.deploy.model import OnnxPolicy, metadata_of, to_onnx
+from worker.deploy.model_file import OnnxPolicy, metadata_of, to_onnx
 from worker.deploy.parity import Recording
 from worker.deploy.rollouts import judge
 from worker.evaluation.episodes import Episodes

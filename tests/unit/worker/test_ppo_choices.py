@@ -15,7 +15,7 @@ from worker.learning.algorithm import Setting, Share, Spaces
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.loss import Clipping, Samples, clipped_loss
-from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
+from worker.learning.ppo.networks import ActorPolicy, PixelModel, build_actor, build_critic
 from worker.settings.ppo import PPOConfig
 
 SMALL: dict[str, Any] = {"channels": (4, 6), "kernel_sizes": (3, 2), "strides": (2, 1), "hidden_sizes": (8,)}

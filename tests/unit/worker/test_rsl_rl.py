@@ -22,7 +22,7 @@ from tests.support.worker.rsl_loop import GRU, Seen, build, restore, save, setti
 from tests.support.worker.sac import same
 from worker.learning.algorithm import Setting, Share, Spaces
 from worker.learning.rsl.algorithm import RslRl
-from worker.learning.rsl.environment import TaskVecEnv
+from worker.learning.rsl.vector_environment import TaskVecEnv
 
 torch.set_num_threads(1)
 

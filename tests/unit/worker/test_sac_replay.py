@@ -12,7 +12,7 @@ from tests.support.worker.loop import alone, groups, iterate, transition_of
 from tests.support.worker.sac import SMALL, make, point
 from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.sac import kernels
-from worker.learning.sac.replay import Replay
+from worker.learning.sac.replay_buffer import Replay
 from worker.learning.sac.sac import SAC
 
 torch.set_num_threads(1)

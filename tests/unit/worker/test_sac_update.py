@@ -17,7 +17,7 @@ from worker.learning.algorithm import Setting, Share, Spaces, Transition
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES
 from worker.learning.sac.networks import Actor, Critics
-from worker.learning.sac.replay import Batch
+from worker.learning.sac.replay_buffer import Batch
 from worker.learning.sac.sac import SAC
 from worker.settings.sac import SACConfig
 

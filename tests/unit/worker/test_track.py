@@ -21,7 +21,7 @@ from tests.conftest import REPOSITORY
 from worker import track
 from worker.learning.job import Job
 from worker.telemetry.services import Ending
-from worker.telemetry.tracking import Tracking
+from worker.telemetry.tracking_processes import Tracking
 from worker.track import Sender, Turn
 
 TRAIN = {"task": "Cartpole", "ppo": {"learning_rate": 0.001}}

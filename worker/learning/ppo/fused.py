@@ -34,8 +34,8 @@ from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.heads import Categorical, Gaussian, Head
 from worker.learning.ppo.loss import LOSSES, Clipping
-from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
-from worker.learning.ppo.rollout import Rollout, View
+from worker.learning.ppo.networks import ActorPolicy, PixelModel, build_actor, build_critic
+from worker.learning.ppo.rollout_buffer import Rollout, View
 from worker.learning.totals import Totals
 from worker.settings.ppo import PPOConfig
 

@@ -10,9 +10,9 @@ from rsl_rl.modules.distribution import GaussianDistribution
 
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms, is_clipped
-from worker.learning.ppo.models import PixelModel
+from worker.learning.ppo.networks import PixelModel
 from worker.learning.ppo.objective import Objective
-from worker.learning.ppo.rollout import Rollout
+from worker.learning.ppo.rollout_buffer import Rollout
 
 
 class Head(Protocol):

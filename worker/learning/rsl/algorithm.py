@@ -20,8 +20,8 @@ from tensordict import TensorDict
 from worker.learning.algorithm import POLICY, Policy, Setting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.rsl import construction as building
-from worker.learning.rsl.environment import as_floats
 from worker.learning.rsl.policy import RslRlPolicy
+from worker.learning.rsl.vector_environment import as_floats
 from worker.settings.rsl_rl import NETWORKS, RslRlConfig
 
 

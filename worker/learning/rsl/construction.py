@@ -21,7 +21,7 @@ from torch import nn
 
 from shared_store.contract.error_text import Refused, kind_of
 from worker.learning.algorithm import Setting, Share, Spaces
-from worker.learning.rsl.environment import as_floats
+from worker.learning.rsl.vector_environment import as_floats
 from worker.settings.errors import is_out_of_memory
 from worker.settings.rsl_rl import NETWORKS, RslRlConfig
 from worker.settings.rsl_rl_checks import check_gradient_length, check_networks

@@ -12,7 +12,7 @@ from torch import nn
 
 from worker.learning.algorithm import ExportedPolicy, Spaces
 from worker.learning.observations import made_up, to_numbers
-from worker.learning.rsl.environment import as_floats
+from worker.learning.rsl.vector_environment import as_floats
 
 
 class RslRlPolicy:

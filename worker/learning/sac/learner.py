@@ -15,7 +15,7 @@ from worker.learning.distributed import Gang
 from worker.learning.optimizers import load_optimizer
 from worker.learning.sac import kernels
 from worker.learning.sac.networks import Actor, Critics, make_normalizer
-from worker.learning.sac.replay import Batch
+from worker.learning.sac.replay_buffer import Batch
 from worker.settings.sac import SACConfig
 
 BETAS = (0.9, 0.95)

@@ -29,7 +29,7 @@ from worker.learning.randomness import mix_seed
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES, Learner
 from worker.learning.sac.networks import Actor, SquashedPolicy, check_spaces, size_of
-from worker.learning.sac.replay import Replay
+from worker.learning.sac.replay_buffer import Replay
 from worker.settings.sac import SACConfig
 
 SAVED = {"cpu": 64 << 20, "cuda": 4 << 20}

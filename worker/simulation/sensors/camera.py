@@ -14,7 +14,12 @@ import warp as wp
 from newton.sensors import SensorCamera
 
 from shared_store.contract.error_text import nearest
-from worker.simulation.camera import (
+from worker.simulation.episodes import EpisodeArrays, random_stream
+from worker.simulation.robot_arrays import BodyArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
+from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.world_cameras import (
     displace,
     displaced,
     draw_light,
@@ -25,11 +30,6 @@ from worker.simulation.camera import (
     shapes_of_worlds,
     to_byte,
 )
-from worker.simulation.episodes import EpisodeArrays, random_stream
-from worker.simulation.robot_arrays import BodyArrays
-from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext, views_of
 
 if TYPE_CHECKING:
     from worker.settings.task import Randomization

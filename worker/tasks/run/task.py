@@ -12,7 +12,6 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.settings.task import TaskConfig, default_rewards, value_at
-from worker.simulation.camera import Camera
 from worker.simulation.capture import CapturedStep, on_torch_stream
 from worker.simulation.episodes import (
     NO_MISHAP,
@@ -27,12 +26,13 @@ from worker.simulation.episodes import (
 )
 from worker.simulation.randomization import Randomizer
 from worker.simulation.terrain import Terrain
+from worker.simulation.world_cameras import Camera
 from worker.simulation.worlds import Worlds
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
-from worker.tasks.run.checks import assert_replays, check_arguments, noise_of
 from worker.tasks.run.episode_records import Ended
 from worker.tasks.run.saved import check_state, completed
+from worker.tasks.run.task_checks import assert_replays, check_arguments, noise_of
 from worker.tasks.run.task_report import Telling
 
 

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orchestrator.api.logs import events as log_events
-from orchestrator.api.logs.events import LogFile, View
+from orchestrator.api.logs import log_events
 from orchestrator.api.logs.filter import parse
+from orchestrator.api.logs.log_events import LogFile, View
 from shared_store.volume.logs import format_line
 
 LINES = ["ERROR 404 in trainer", "ERROR in loader", "WARN: loss is nan", "iteration 12/300", 'said "hi" at 50%', "",

@@ -18,7 +18,7 @@ from orchestrator.control.retention import RunNeeded
 from orchestrator.control.retention_looks import Place, Whose
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY
-from orchestrator.persistence import references
+from orchestrator.persistence import retention_rows
 from orchestrator.persistence.models import (
     Attempt,
     Dependency,
@@ -215,7 +215,7 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
         patched.setattr("shared_store.volume.trash.os.rename", dying(os.rename))
         patched.setattr("shared_store.volume.trash.sync_directory", dying(sync_directory))
         patched.setattr("shared_store.volume.trash.shutil.rmtree", dying(shutil.rmtree))
-        patched.setattr("orchestrator.persistence.references.forget_jobs", dying(references.forget_jobs))
+        patched.setattr("orchestrator.persistence.retention_rows.forget_jobs", dying(retention_rows.forget_jobs))
         try:
             world.retention().take_all()
         except Killed:

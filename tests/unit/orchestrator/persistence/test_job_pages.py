@@ -17,7 +17,7 @@ from orchestrator.domain.job import Status
 from orchestrator.persistence.job_counts import JobCounts, Place, note_rows
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.models import Attempt, Job, Node
-from orchestrator.persistence.references import forget_jobs
+from orchestrator.persistence.retention_rows import forget_jobs
 from orchestrator.persistence.session import Database
 
 QUEUES = [f"queue-{number}" for number in range(60)]

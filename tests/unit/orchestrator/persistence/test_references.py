@@ -10,7 +10,7 @@ from sqlalchemy import select, text
 
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS, Rules
 from orchestrator.persistence.models import Job
-from orchestrator.persistence.references import due, jobs_of_runs
+from orchestrator.persistence.retention_rows import due, jobs_of_runs
 from orchestrator.persistence.session import Database
 from tests.support.orchestrator.rows import job
 

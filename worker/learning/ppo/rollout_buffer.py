@@ -1,4 +1,4 @@
-"""A rollout: the data of one iteration of all worlds, in buffers with fixed addresses."""
+"""The rollout buffer: the data of one iteration of all worlds, in buffers with fixed addresses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import nn
 
 from worker.learning.algorithm import Transition
 from worker.learning.ppo import linear_layers as linear
-from worker.learning.ppo.models import PixelModel
+from worker.learning.ppo.networks import PixelModel
 
 
 class View:

@@ -1,4 +1,4 @@
-"""The ``track`` section of the job YAML: the services to which a training's metrics are sent as well."""
+"""The tracking services of a job, its YAML's section ``track``: those to which a training's metrics are sent as well."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Whether the worlds fit into memory. Measured on a few worlds, because solver and torch buffer sizes cannot be computed in advance."""
+"""The estimate of memory: whether the worlds fit. Measured on a few worlds, because solver and torch buffer sizes cannot be computed in advance."""
 
 from __future__ import annotations
 

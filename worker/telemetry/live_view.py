@@ -1,4 +1,4 @@
-"""``python -m worker.telemetry.view``: show a training as it runs, a checkpoint's policy or a recording in Rerun's web viewer.
+"""``python -m worker.telemetry.live_view``: show a training as it runs, a checkpoint's policy or a recording in Rerun's web viewer.
 
 ``muster view`` starts it. Rerun runs in this process and in its child; a rank never imports it.
 """
@@ -60,7 +60,7 @@ class Training:
     """
 
     def __init__(self, run: Run, job: str, worlds: int, stop: list[int], activity: Activity) -> None:
-        from worker.telemetry.live import stage_of
+        from worker.telemetry.live_recording import stage_of
         from worker.telemetry.tap_request import PATIENCE, Asking
 
         self._run, self._stop = run, stop
@@ -328,7 +328,7 @@ def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | No
 
 def main() -> int:
     """Read the arguments; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m worker.telemetry.view")
+    parser = argparse.ArgumentParser(prog="python -m worker.telemetry.live_view")
     what = parser.add_mutually_exclusive_group(required=True)
     for name in ("--training", "--policy", "--file"):
         what.add_argument(name, type=Path)

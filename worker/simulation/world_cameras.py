@@ -1,4 +1,4 @@
-"""One camera per world, which renders straight into the buffer that the policy reads."""
+"""The cameras of the worlds, one in each: they render straight into the buffer that the policy reads."""
 
 from __future__ import annotations
 

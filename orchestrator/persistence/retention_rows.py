@@ -1,4 +1,4 @@
-"""References in the database to runs and jobs, and the facts about jobs on which retention decides."""
+"""The rows by which retention decides: references to runs and jobs, and the facts about jobs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the store has of runs, and what in it needs them, as retention asks (:mod:`.retention`)."""
+"""The facts about runs in the store, and what in it needs them, as retention asks (:mod:`.retention`)."""
 
 from __future__ import annotations
 
