@@ -29,11 +29,11 @@ def main() -> int:
 
 
 def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
-    from worker.learning.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import REPORT_SECONDS, RankPlacement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
     with user_errors():
-        placement = Placement.from_env(os.environ)
+        placement = RankPlacement.from_env(os.environ)
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     if not isinstance(job.section.get("task"), str):

@@ -81,7 +81,7 @@ class Reconciler:
         self._thread: threading.Thread | None = None
         bus.changed = engines.changed = alarm.gang_changed
         database.committed, database.changed = self._committed, self._look_again
-        isolation.before, loaded.reread = attempts.share, attempts.forget_states
+        isolation.before, loaded.reread = attempts.load_shared_rows, attempts.forget_states
         with database.session() as session:
             clock.restore(session)
             self._take_up(session)  # before the router is there for the nodes

@@ -23,10 +23,10 @@ from orchestrator.scheduling.snapshot import (
     FairShare,
     Leading,
     Queue,
-    Running,
+    RoundRobin,
+    RunningGang,
     Snapshot,
     TimeLimit,
-    Turns,
     Waiting,
 )
 
@@ -44,7 +44,7 @@ def take_snapshot(
     waiting: Sequence[Waiting],
     holding: Sequence[tuple[Job, Attempt]],
     leading: Mapping[str, Leading],
-    turns: Turns,
+    turns: RoundRobin,
     first: str = "local",
     unknown: Mapping[str, str] | None = None,
 ) -> Snapshot:
@@ -161,12 +161,12 @@ def new_nodes(placements: Sequence[Placement]) -> list[Node]:
     ]
 
 
-def _running(job: Job, attempt: Attempt) -> Running:
+def _running(job: Job, attempt: Attempt) -> RunningGang:
     try:
         options = job.gang.options
     except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
         options = NativeOptions()
-    return Running(
+    return RunningGang(
         job=job.id,
         name=job.name,
         queue=job.queue,

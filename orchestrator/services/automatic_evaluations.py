@@ -20,7 +20,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.controller import Controller
-from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain.errors import ClientError, SpecError, Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
@@ -276,7 +276,7 @@ def _counted(row: AutomaticEvaluation | None, training: _Training, checkpoints: 
     return Counted(row.seen, row.waiting, row.passed)
 
 
-def _row(session: Session, training: _Training, counted: Counted, found: RunFacts) -> AutomaticEvaluation:
+def _row(session: Session, training: _Training, counted: Counted, found: ObservedRun) -> AutomaticEvaluation:
     row = session.get(AutomaticEvaluation, training.run.name)
     if row is None:
         row = AutomaticEvaluation(run=training.run.name)

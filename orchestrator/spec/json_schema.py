@@ -23,7 +23,7 @@ def schema() -> dict[str, Any]:
     definitions["NodeRange"] = {
         "anyOf": [{"type": "integer", "minimum": 1, "maximum": MOST_NODES}, definitions["NodeRange"]]
     }
-    definitions["Track"] = track_schema(definitions["Track"])
+    definitions["TrackingServices"] = track_schema(definitions["TrackingServices"])
     definitions["Train"]["properties"]["task"]["examples"] = known_tasks()
     definitions["Train"]["properties"]["algorithm"]["examples"] = list(ALGORITHMS)
     text = {"type": ["string", "number"]}

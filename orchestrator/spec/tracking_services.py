@@ -59,7 +59,7 @@ class MLflow(Section):
     tags: dict[str, str] = Field(default_factory=dict)
 
 
-class Track(Section):
+class TrackingServices(Section):
     """Services that get the metrics of a training: ``wandb``, ``[wandb, mlflow]``, or each with its settings."""
 
     wandb: WandB | None = None

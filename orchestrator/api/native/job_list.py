@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.control.controller import Controller
-from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
@@ -248,7 +248,7 @@ def _progress(controller: Controller, actor: Actor, trainings: Sequence[_Trainin
 
 def _read(
     actor: Actor, store: Store, trainings: Sequence[_Training]
-) -> tuple[Mapping[str, Sequence[Mapping[str, Any]]], Mapping[str, RunFacts]]:
+) -> tuple[Mapping[str, Sequence[Mapping[str, Any]]], Mapping[str, ObservedRun]]:
     """By job its curve, and by name the runs whose owners must be known."""
     read = {each.job.id: curves.of(store.run(each.job.run), each.job) for each in trainings}
     names = {each.job.run for each in trainings} if actor.queues is not None else set()

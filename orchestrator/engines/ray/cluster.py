@@ -22,7 +22,7 @@ _STARTING = 40.0
 """Seconds that the watch may take for its first word."""
 
 
-class Watch:
+class ClusterWatch:
     """The state of the cluster, reported periodically by a process that imports Ray."""
 
     def __init__(self, head: str, environment: Mapping[str, str]) -> None:

@@ -10,7 +10,7 @@ from racer.rewards.translation.calls import Calls
 from racer.rewards.translation.expression_values import (
     C_TYPES,
     Constant,
-    Group,
+    ItemList,
     Outside,
     Thing,
     Value,
@@ -329,13 +329,13 @@ def _check_kept(value: Value, node: ast.AST) -> None:
     """Refuse what holds good only where it is written."""
     if isinstance(value, Thing) and value.kind == "iterated":
         raise Outside(node, f"{value.name} that is kept for later")
-    for item in value.items if isinstance(value, Group) else ():
+    for item in value.items if isinstance(value, ItemList) else ():
         _check_kept(item, node)
 
 
 def _sees(value: Value) -> bool:
     """Whether a value is, or holds, a function that sees the variables of the function around it."""
-    if isinstance(value, Group):
+    if isinstance(value, ItemList):
         return any(map(_sees, value.items))
     return isinstance(value, Thing) and value.scope is not None
 

@@ -76,8 +76,8 @@ def what_is_to_end_is_launched() -> Mutant:
     """B9: a gang that is preempted before its launch is launched all the same."""
     step = rules.step
 
-    def stepped(state: rules.State, event: Event) -> Instructions:
-        if state.phase is rules.Phase.LAUNCHING and state.verdict is not None:
+    def stepped(state: rules.AttemptState, event: Event) -> Instructions:
+        if state.phase is rules.AttemptPhase.LAUNCHING and state.verdict is not None:
             if isinstance(event, Due):
                 return (Launch(),)
             if isinstance(event, LaunchDelayed):
@@ -91,7 +91,7 @@ def a_launched_gang_waits_for_its_look() -> Mutant:
     """A gang is launched, and nobody looks at it until the next look at an attempt for which nothing is due."""
     step = rules.step
 
-    def stepped(state: rules.State, event: Event) -> Instructions:
+    def stepped(state: rules.AttemptState, event: Event) -> Instructions:
         done = step(state, event)
         return done[:-1] if isinstance(event, Launched) and done else done
 
@@ -134,7 +134,7 @@ def a_fault_is_forgotten() -> Mutant:
     """The same fault is tried as often as the job has attempts."""
     step = rules.step
 
-    def stepped(state: rules.State, event: Event) -> Instructions:
+    def stepped(state: rules.AttemptState, event: Event) -> Instructions:
         return step(replace(state, terms=replace(state.terms, last_fault=None)), event)
 
     return mock.patch.object(attempts, "step", stepped)

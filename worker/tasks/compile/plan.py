@@ -120,7 +120,7 @@ class Happening:
     seconds: int = -1
 
 
-class Plan:
+class KernelPlan:
     """The contents of a task's kernels.
 
     Args:

@@ -27,7 +27,7 @@ from worker.tasks.compile.compiler import Kernels, further
 from worker.tasks.compile.contract import contract
 from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.compile.numbers import flat
-from worker.tasks.compile.plan import Plan, stacked
+from worker.tasks.compile.plan import KernelPlan, stacked
 from worker.tasks.declare.declaration import Choice, Declaration
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
@@ -108,7 +108,7 @@ class DeclaredTask(Task):
                 with placed(f"task {type(self).__name__}: sensors.{name}"):
                     sensor.rows(self.views)
         try:
-            self.plan = Plan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
+            self.plan = KernelPlan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
             check_patterns(self.declaration.randomize, self.views)
             if isinstance(self.ground_terrain, Terrain):
                 self.ground_terrain.check_memory()

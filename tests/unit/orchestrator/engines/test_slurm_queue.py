@@ -46,7 +46,7 @@ class Cluster:
 
     def call(self, *command: str, **_: Any) -> str:
         if self.away:
-            raise slurm_commands.Unreachable("slurmctld does not answer")
+            raise slurm_commands.SlurmUnreachable("slurmctld does not answer")
         if command[0] == "scancel" and len(command) == 2:
             self.states[command[1]] = "CANCELLED"
         if command[0] != "squeue":

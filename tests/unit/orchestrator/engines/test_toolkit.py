@@ -321,7 +321,7 @@ def test_a_slurm_that_went_away_can_t_tell_its_hosts_and_its_last_answer_is_not_
 
     def call(*command: str, **_: object) -> str:
         if not answers:
-            raise slurm_commands.Unreachable("slurmctld does not answer")
+            raise slurm_commands.SlurmUnreachable("slurmctld does not answer")
         return answers[0] if "nodes" in command else ""
 
     monkeypatch.setattr(slurm_commands, "call", call)
