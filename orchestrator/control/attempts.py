@@ -209,7 +209,7 @@ class Attempts:
                     if then is not None:
                         yield from self._happened(session, job, attempt, opened, then)
 
-    def share(self, session: Session, jobs: Sequence[Job]) -> None:
+    def load_shared_rows(self, session: Session, jobs: Sequence[Job]) -> None:
         """These jobs are worked on next: what their attempts share is read once."""
         self._rows = SharedRows(session, jobs)
 

@@ -196,7 +196,7 @@ def test_a_slurm_that_never_answers_ends_the_stop(monkeypatch: pytest.MonkeyPatc
     from orchestrator.engines.slurm import engine as slurm
 
     def away(*_: str, **__: Any) -> str:
-        raise slurm.Unreachable("slurmctld does not answer (connection refused); see `scontrol ping`")
+        raise slurm.SlurmUnreachable("slurmctld does not answer (connection refused); see `scontrol ping`")
 
     monkeypatch.setattr("orchestrator.engines.slurm.slurm_commands.call", lambda *_, **__: "")
     engine = slurm.SlurmEngine()
