@@ -35,9 +35,9 @@ from orchestrator.engines.api import Engine, Gang, Handle, Plan, Traits
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job, now
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
+from orchestrator.persistence.table_models import Job, now
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Store
 from shared_store.volume.node_outcomes import Outcome, write_outcome

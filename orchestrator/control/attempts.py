@@ -69,8 +69,8 @@ from orchestrator.domain.job import Ending, Status
 from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.log_groups import record_logs
-from orchestrator.persistence.models import Attempt, Job, now
 from orchestrator.persistence.ownership import first_description, record_owner
+from orchestrator.persistence.table_models import Attempt, Job, now
 from orchestrator.scheduling.decisions import Start
 from shared_store.volume.epoch import Claim
 

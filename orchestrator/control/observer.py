@@ -16,7 +16,7 @@ from orchestrator.domain.attempt_events import Observed, Silence
 from orchestrator.domain.job import NodeEnd, aws_ending
 from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.models import Attempt, Job, Node, now
+from orchestrator.persistence.table_models import Attempt, Job, Node, now
 from shared_store.volume.node_outcomes import Outcome
 
 CHECK_INTERVAL = 5.0

@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session, defer, selectinload
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.persistence.keyset import behind
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.table_models import Job
 
 _KEYS = (Job.created_at, Job.id)
 _MOST_PARTS = 100

@@ -1,6 +1,6 @@
 """The models of what a controller is and keeps: its clock, store, account, keys, secrets, texts, messages, log groups, uses of runs and queues.
 
-Jobs are in :mod:`.models`.
+Jobs are in :mod:`.table_models`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from sqlalchemy.orm import Mapped, mapped_column, validates
 
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.persistence.columns import storable
-from orchestrator.persistence.models import Base, now
+from orchestrator.persistence.table_models import Base, now
 
 
 class ClockState(Base):

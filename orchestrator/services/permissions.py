@@ -32,7 +32,8 @@ from typing import Any
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import named
-from orchestrator.persistence.models import (
+from orchestrator.persistence.own_models import LogGroup
+from orchestrator.persistence.table_models import (
     ComputeEnvironment,
     Job,
     JobDefinition,
@@ -40,7 +41,6 @@ from orchestrator.persistence.models import (
     RunRecord,
     SchedulingPolicy,
 )
-from orchestrator.persistence.own_models import LogGroup
 
 HIDDEN = "(hidden)"
 """Stands for the value of an environment variable that the caller may not read."""
