@@ -10,8 +10,8 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import UsageError
 from orchestrator.engines.installed import ENGINES
+from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 from orchestrator.persistence.own_models import KnownAccount, LogGroup
-from orchestrator.persistence.table_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import Reason, named
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.table_models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.scheduling.decisions import Cancel, Decisions, Preempt, Start, decide
 from orchestrator.scheduling.reasons import WaitReport
 from orchestrator.scheduling.snapshot import Leading, RoundRobin

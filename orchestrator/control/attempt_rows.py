@@ -13,7 +13,7 @@ from sqlalchemy.orm import Session
 from orchestrator.control.compute_environments import options_of
 from orchestrator.domain.attempt import AttemptState, Terms
 from orchestrator.domain.job import Ending, Status, Verdict
-from orchestrator.persistence.table_models import (
+from orchestrator.persistence.batch_models import (
     Attempt,
     ComputeEnvironment,
     Job,

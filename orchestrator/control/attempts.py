@@ -22,15 +22,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.kept_texts import KeptTexts, references_of
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import CHECK_INTERVAL, Observer
-from orchestrator.control.run_store import (
-    Errands,
-    Key,
-    ObservedRun,
-    RunProgress,
-    RunRefused,
-    RunStore,
-    StoreUnavailable,
-)
+from orchestrator.control.run_store import Errands, Key, ObservedRun, RunContent, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
@@ -68,9 +60,9 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status
 from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence.batch_models import Attempt, Job, now
 from orchestrator.persistence.log_groups import record_logs
 from orchestrator.persistence.ownership import first_description, record_owner
-from orchestrator.persistence.table_models import Attempt, Job, now
 from orchestrator.scheduling.decisions import Start
 from shared_store.volume.epoch import Claim
 
@@ -101,7 +93,7 @@ class _Open:
     """The run, as it was found before the attempt takes it."""
     taking: Callable[[], int] | None = None
     """Takes the run; returns the epoch."""
-    progress: RunProgress | None = None
+    progress: RunContent | None = None
     """What the run holds once the gang is stopped."""
     uncommitted: list[Callable[[], None]] = field(default_factory=list)
     """What the metrics are to note after the next commit."""

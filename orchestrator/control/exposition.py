@@ -21,8 +21,8 @@ from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.store_calls import THREADS
 from orchestrator.control.usage import held_by
 from orchestrator.domain.job import Status
+from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.persistence.session import DatabaseError
-from orchestrator.persistence.table_models import JobQueue
 from shared_store import __version__
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"

@@ -14,9 +14,9 @@ from orchestrator.control.loaded import LoadedJobs
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.columns import storable
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
-from orchestrator.persistence.table_models import Job
 
 _AT_ONCE = 1000
 """Jobs that share their commits, at most: one that fails has all of them done again, half of them at a time."""

@@ -22,10 +22,10 @@ from orchestrator import machine
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL
+from orchestrator.persistence.batch_models import Job, JobDefinition, now
 from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.retention_rows import is_of_submission
 from orchestrator.persistence.session import Database, DatabaseError
-from orchestrator.persistence.table_models import Job, JobDefinition, now
 from shared_store.volume import texts
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import LARGEST, Reference

@@ -9,8 +9,8 @@ from contextlib import contextmanager
 from sqlalchemy import select
 from sqlalchemy.orm import Session, selectinload
 
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Job
 
 
 class LoadedJobs:

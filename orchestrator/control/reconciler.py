@@ -28,8 +28,8 @@ from orchestrator.control.upkeep import INTERVAL, Upkeep
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.control.writes import Writes
 from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence.batch_models import Attempt, Job
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Attempt, Job
 
 _SETTLED_A_TICK = 1000
 """Jobs that only change their state, in one pass: a large array that ends must not delay the looks at running gangs."""

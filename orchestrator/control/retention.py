@@ -31,9 +31,9 @@ from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.retention import JobFacts, References, RetentionRules, RunFacts, decide, still_needed
 from orchestrator.persistence import retention_rows as rows
+from orchestrator.persistence.batch_models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Job, JobQueue, RunRecord, now
 from shared_store.contract.error_text import counted
 from shared_store.volume import contents, trash
 from shared_store.volume.files import DamagedFile

@@ -78,7 +78,7 @@ def facts_of(run: Run) -> ObservedRun:
 
 
 @dataclass(frozen=True)
-class RunProgress:
+class RunContent:
     """What a run holds after an attempt."""
 
     iteration: int | None = None
@@ -135,17 +135,17 @@ class RunStore:
 
         return self._call("read outcomes", body)
 
-    def progress(self, name: str, epoch: int) -> RunProgress:
+    def progress(self, name: str, epoch: int) -> RunContent:
         """What the run holds after the attempt of this epoch."""
 
-        def body() -> RunProgress:
+        def body() -> RunContent:
             checkpoints = list_checkpoints(self.store.run(name))
             iteration = checkpoints[-1].iteration if checkpoints else None
             for checkpoint in reversed(checkpoints):
                 if checkpoint.epoch == epoch:
                     with suppress(DamagedCheckpoint, KeyError, TypeError, ValueError):
-                        return RunProgress(iteration, float(checkpoint.manifest["created"]))
-            return RunProgress(iteration)
+                        return RunContent(iteration, float(checkpoint.manifest["created"]))
+            return RunContent(iteration)
 
         return self._call(f"read the checkpoints of run {name}", body)
 

@@ -15,8 +15,8 @@ from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Capacity, Host, Placement, Queued, engine_of
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence import table_models
-from orchestrator.persistence.table_models import Attempt, Job, JobQueue, Node, SchedulingPolicy
+from orchestrator.persistence import batch_models
+from orchestrator.persistence.batch_models import Attempt, Job, JobQueue, Node, SchedulingPolicy
 from orchestrator.scheduling.fit import Fit, fit
 from orchestrator.scheduling.snapshot import (
     ComputeEnvironment,
@@ -69,7 +69,7 @@ def take_snapshot(
     }
     ces = {
         each.name: read_compute_environment(each, first, unknown)
-        for each in session.scalars(select(table_models.ComputeEnvironment), execution_options=anew)
+        for each in session.scalars(select(batch_models.ComputeEnvironment), execution_options=anew)
     }
     # what runs on an engine that queues by itself takes nothing away from what is handed to it
     queueing = {name for name, capacity in capacities.items() if isinstance(capacity, Queued)}
@@ -142,7 +142,7 @@ def _fair_share(document: Mapping[str, Any]) -> FairShare:
 
 
 def read_compute_environment(
-    row: table_models.ComputeEnvironment, first: str, unknown: Mapping[str, str] | None = None
+    row: batch_models.ComputeEnvironment, first: str, unknown: Mapping[str, str] | None = None
 ) -> ComputeEnvironment:
     """``first``: the engine of one that names none. ``unknown``: why an engine has not told what it has, by the names of those."""
     named = row.tags.get(HOSTS_TAG)

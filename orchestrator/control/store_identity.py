@@ -9,8 +9,8 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import Unavailable
+from orchestrator.persistence.batch_models import Attempt, Job
 from orchestrator.persistence.own_models import KnownStore
-from orchestrator.persistence.table_models import Attempt, Job
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Store, StoreError
 from shared_store.volume.plugin_folders import note_plugins

@@ -11,7 +11,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session, attributes
 
 from orchestrator.domain.job import Status
-from orchestrator.persistence.table_models import Job
+from orchestrator.persistence.batch_models import Job
 
 
 class ArrayRole(Enum):

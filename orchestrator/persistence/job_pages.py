@@ -11,8 +11,8 @@ from sqlalchemy import ColumnElement, func, or_, select, union_all
 from sqlalchemy.orm import Session, defer, selectinload
 
 from orchestrator.domain.errors import RequestError
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.keyset import behind
-from orchestrator.persistence.table_models import Job
 
 _KEYS = (Job.created_at, Job.id)
 _MOST_PARTS = 100

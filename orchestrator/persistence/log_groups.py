@@ -9,8 +9,8 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
+from orchestrator.persistence.batch_models import Job, Node
 from orchestrator.persistence.own_models import LogGroup
-from orchestrator.persistence.table_models import Job, Node
 
 MOST = 1000
 """Log groups of a key."""

@@ -10,9 +10,9 @@ from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.retention import A_DAY, JobFacts, RetentionReference, RetentionRules
+from orchestrator.persistence.batch_models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
 from orchestrator.persistence.job_counts import ArrayRole, note_rows
 from orchestrator.persistence.own_models import AutomaticEvaluation, RunUse, ShareUsage, WebhookDelivery
-from orchestrator.persistence.table_models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
 
 _SUBMITTED = {"MUSTER_DIRECTORY", "MUSTER_SPEC"}
 """Variables of a definition which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""

@@ -1,6 +1,6 @@
 """Automatic evaluations: jobs that the controller submits beside a training whose spec has a section ``evaluation``.
 
-The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.table_models.AutomaticEvaluation`), which changes in
+The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.batch_models.AutomaticEvaluation`), which changes in
 the transaction that adds the job: a controller that is killed at any moment neither loses nor doubles an evaluation. A training never
 waits for one, and the reconcile loop neither: this has threads for itself.
 """
@@ -25,9 +25,9 @@ from orchestrator.domain.errors import ClientError, SpecError, Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
 from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import is_of_earlier_run
-from orchestrator.persistence.table_models import Job
 from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.permissions import CONTROLLER, Actor
 from orchestrator.services.spec_submission import submit

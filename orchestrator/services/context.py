@@ -17,9 +17,9 @@ from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ClientError, RequestError
 from orchestrator.domain.job import Status
+from orchestrator.persistence.batch_models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
-from orchestrator.persistence.table_models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.services.arns import plain_name
 from orchestrator.services.damaged_rows import DamagedRow
 from orchestrator.services.permissions import Actor, JobsOf, Operation

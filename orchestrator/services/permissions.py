@@ -32,8 +32,7 @@ from typing import Any
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import named
-from orchestrator.persistence.own_models import LogGroup
-from orchestrator.persistence.table_models import (
+from orchestrator.persistence.batch_models import (
     ComputeEnvironment,
     Job,
     JobDefinition,
@@ -41,6 +40,7 @@ from orchestrator.persistence.table_models import (
     RunRecord,
     SchedulingPolicy,
 )
+from orchestrator.persistence.own_models import LogGroup
 
 HIDDEN = "(hidden)"
 """Stands for the value of an environment variable that the caller may not read."""

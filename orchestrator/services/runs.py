@@ -12,9 +12,9 @@ from sqlalchemy.orm import Session
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from orchestrator.persistence.batch_models import Job, RunRecord
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs_of, owner_of
-from orchestrator.persistence.table_models import Job, RunRecord
 from orchestrator.services.context import visible_runs
 from orchestrator.services.damaged_rows import DamagedRow, reading
 from orchestrator.services.permissions import Actor

@@ -12,9 +12,9 @@ from typing import Any, TypeVar
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec, NodeSpec
+from orchestrator.persistence.batch_models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
-from orchestrator.persistence.table_models import RunRecord
 from orchestrator.services.context import Context, archived, permitted_run, release
 from orchestrator.services.evaluated_checkpoints import check_evaluation
 from orchestrator.services.permissions import Operation

@@ -19,11 +19,11 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
 from orchestrator.persistence import log_groups
+from orchestrator.persistence.batch_models import Dependency, Job, JobDefinition, JobQueue, now
 from orchestrator.persistence.gangs import gangs
 from orchestrator.persistence.job_counts import ArrayRole, note_rows
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import note_changed
-from orchestrator.persistence.table_models import Dependency, Job, JobDefinition, JobQueue, now
 from orchestrator.services import permissions
 from orchestrator.services.arns import definition_arn, job_arn
 from orchestrator.services.context import Context, archived

@@ -15,7 +15,7 @@ from orchestrator.api.batch.paging import page, page_size
 from orchestrator.control.compute_environments import is_built_in
 from orchestrator.domain.errors import ClientError
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.table_models import ComputeEnvironment, JobQueue, SchedulingPolicy
+from orchestrator.persistence.batch_models import ComputeEnvironment, JobQueue, SchedulingPolicy
 from orchestrator.services.arns import compute_environment_arn, ecs_arn, iam_arn, plain_name, policy_arn
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation, Shared

@@ -10,7 +10,7 @@ from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.descriptions import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.table_models import JobDefinition
+from orchestrator.persistence.batch_models import JobDefinition
 from orchestrator.services import permissions
 from orchestrator.services.arns import definition_arn, plain_name
 from orchestrator.services.context import Context

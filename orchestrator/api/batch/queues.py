@@ -14,7 +14,7 @@ from orchestrator.control.compute_environments import environments_of
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.usage import utilization
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.table_models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
+from orchestrator.persistence.batch_models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
 from orchestrator.services.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import JobsOf, Operation, Shared

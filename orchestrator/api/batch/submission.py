@@ -9,7 +9,7 @@ from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.members import check_consumables
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.table_models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.services.arns import split_reference
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation

@@ -7,7 +7,7 @@ from typing import Any
 from orchestrator.api.batch import validation
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.table_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
+from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 from orchestrator.services.arns import split_arn
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation

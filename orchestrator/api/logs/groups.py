@@ -18,8 +18,8 @@ from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups
+from orchestrator.persistence.batch_models import Job, Node
 from orchestrator.persistence.own_models import LogGroup, LogStream
-from orchestrator.persistence.table_models import Job, Node
 from orchestrator.services import permissions
 from orchestrator.services.arns import log_group_arn
 from orchestrator.services.permissions import Actor, Operation

@@ -21,7 +21,7 @@ from orchestrator.control.controller import Controller
 from orchestrator.control.log_hub import Waker
 from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.store_calls import StoreSilent
-from orchestrator.persistence.table_models import now
+from orchestrator.persistence.batch_models import now
 from orchestrator.services.permissions import Actor
 from shared_store.volume.layout import Run
 from shared_store.volume.log_view import Chosen, Key, LogView

@@ -32,7 +32,7 @@ from orchestrator.api.logs.log_events import LogEvent, event_id, first_and_last
 from orchestrator.api.logs.streams import Stream, created_streams, find_stream, newest_streams
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import RequestError, Unavailable
-from orchestrator.persistence.table_models import now
+from orchestrator.persistence.batch_models import now
 from orchestrator.services.arns import here, log_group_arn
 from orchestrator.services.permissions import Actor, Operation, Refusal
 

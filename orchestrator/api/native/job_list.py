@@ -21,9 +21,9 @@ from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
 from orchestrator.domain.reasons import Reason, array_of
+from orchestrator.persistence.batch_models import Job, RunRecord
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.ownership import owner_of
-from orchestrator.persistence.table_models import Job, RunRecord
 from orchestrator.services.context import queue_names
 from orchestrator.services.damaged_rows import DAMAGED, DamagedRow, reading
 from orchestrator.services.fit import UnknownQueue

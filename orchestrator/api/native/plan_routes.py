@@ -20,7 +20,7 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.table_models import Attempt, ComputeEnvironment, Job
+from orchestrator.persistence.batch_models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
 from orchestrator.services.context import permitted_run
 from orchestrator.services.evaluated_checkpoints import check_evaluation

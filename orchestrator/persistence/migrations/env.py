@@ -2,8 +2,8 @@
 
 from alembic import context
 
+from orchestrator.persistence.batch_models import Base
 from orchestrator.persistence.own_models import KnownAccount  # noqa: F401 (its tables, too)
-from orchestrator.persistence.table_models import Base
 
 context.configure(
     connection=context.config.attributes["connection"],

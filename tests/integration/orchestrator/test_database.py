@@ -22,12 +22,7 @@ from orchestrator.control.usage import add_usage, charge, resource_seconds, usag
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.errors import ApiError, RequestError, ServerError, UsageError
 from orchestrator.persistence.access_keys import KeyStore, KeyUsageError
-from orchestrator.persistence.own_models import RetentionStart, RunUse
-from orchestrator.persistence.own_secrets import OwnSecrets
-from orchestrator.persistence.queries import find_job
-from orchestrator.persistence.schema import NEWEST
-from orchestrator.persistence.session import Database, DatabaseError
-from orchestrator.persistence.table_models import (
+from orchestrator.persistence.batch_models import (
     Attempt,
     Base,
     ComputeEnvironment,
@@ -37,6 +32,11 @@ from orchestrator.persistence.table_models import (
     RunRecord,
     now,
 )
+from orchestrator.persistence.own_models import RetentionStart, RunUse
+from orchestrator.persistence.own_secrets import OwnSecrets
+from orchestrator.persistence.queries import find_job
+from orchestrator.persistence.schema import NEWEST
+from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
 from tests.conftest import Serving, wait_for
 from tests.support.orchestrator import postgres

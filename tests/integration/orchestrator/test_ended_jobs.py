@@ -17,7 +17,7 @@ from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import Gang, Handle, NotYet, Plan
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.table_models import Job, JobQueue
+from orchestrator.persistence.batch_models import Job, JobQueue
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.waiting import wait_for
 

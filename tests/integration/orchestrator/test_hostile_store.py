@@ -13,8 +13,8 @@ from sqlalchemy import select
 
 from orchestrator.api.logs.log_events import log_file
 from orchestrator.client import Client
+from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.persistence.session import Database, DatabaseError
-from orchestrator.persistence.table_models import Job, JobQueue
 from orchestrator.server import Server
 from shared_store.volume.epoch import close_claim, raise_epoch, read_epoch
 from shared_store.volume.files import DamagedFile, write_json

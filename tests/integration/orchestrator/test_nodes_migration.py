@@ -17,8 +17,8 @@ import pytest
 from sqlalchemy import create_engine, select, text
 
 from orchestrator.domain.hosts import Placement
+from orchestrator.persistence.batch_models import Attempt, Job, JobQueue, Node
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Attempt, Job, JobQueue, Node
 from shared_store.volume.epoch import Claim, take_epoch
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.databases import connected, migrate

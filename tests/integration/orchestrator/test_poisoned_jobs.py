@@ -37,8 +37,8 @@ from orchestrator.engines.api import (
     Plan,
 )
 from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import DatabaseError
-from orchestrator.persistence.table_models import Attempt, Job, Node
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.orchestrator.rows import job
 from tests.support.waiting import wait_for

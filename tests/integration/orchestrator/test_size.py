@@ -12,8 +12,8 @@ from sqlalchemy import event, func, select
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.api.logs.streams import newest_streams
 from orchestrator.domain.errors import ClientError
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Attempt, Job, Node
 from orchestrator.server import Server
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import CONTROLLER, Actor

@@ -27,8 +27,8 @@ from orchestrator.engines.api import Handle
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.home import HomeLock
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.session import Database, DatabaseError
-from orchestrator.persistence.table_models import Job
 from orchestrator.server import Server
 from shared_store.volume import epoch, files
 from tests.conftest import submit_gang, wait_for

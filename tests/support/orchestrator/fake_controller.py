@@ -14,8 +14,8 @@ from orchestrator.control.run_store import RunStore
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Job, JobQueue
 from shared_store.volume.layout import Store
 from shared_store.volume.node_outcomes import Outcome, write_outcome
 from tests.support.orchestrator.rows import job

@@ -16,9 +16,9 @@ from orchestrator.control.retention import Retention
 from orchestrator.control.retention_looks import CONTROLLER, PassCursor, Step, Whose
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS
+from orchestrator.persistence.batch_models import Attempt, Base, Dependency, Job, Node, RunRecord, now
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Attempt, Base, Dependency, Job, Node, RunRecord, now
 from shared_store.volume.files import write_json
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.rows import job

@@ -13,9 +13,9 @@ from typing import Any
 from orchestrator import machine as seam
 from orchestrator.control.controller import Controller
 from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import DatabaseError
-from orchestrator.persistence.table_models import Job
 from tests.support.simulation.bus import SimulatedBus
 from tests.support.simulation.cluster import Cluster, SimulatedNode
 from tests.support.simulation.database import SimulatedDatabase, new_memory

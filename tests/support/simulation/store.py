@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.control.run_store import ObservedRun, RunProgress, RunStore
+from orchestrator.control.run_store import ObservedRun, RunContent, RunStore
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Store
 from shared_store.volume.node_outcomes import Outcome
@@ -119,11 +119,11 @@ class SimulatedRunStore(RunStore):
 
         return self._call("read outcomes", body)
 
-    def progress(self, name: str, epoch: int) -> RunProgress:
-        def body() -> RunProgress:
+    def progress(self, name: str, epoch: int) -> RunContent:
+        def body() -> RunContent:
             self._wait()
             run = self._world.volume.read(name)
-            return RunProgress(run.iteration, run.saved.get(epoch))
+            return RunContent(run.iteration, run.saved.get(epoch))
 
         return self._call(f"read the checkpoints of run {name}", body)
 

@@ -19,8 +19,7 @@ from orchestrator.control.retention_looks import PassCursor, Whose
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY
 from orchestrator.persistence import retention_rows
-from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
-from orchestrator.persistence.table_models import (
+from orchestrator.persistence.batch_models import (
     Attempt,
     Dependency,
     JobDefinition,
@@ -29,6 +28,7 @@ from orchestrator.persistence.table_models import (
     RunRecord,
     now,
 )
+from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
 from shared_store.volume import contents, trash
 from shared_store.volume.files import sync_directory
 from shared_store.volume.layout import Store

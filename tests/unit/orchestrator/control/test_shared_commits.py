@@ -14,9 +14,9 @@ from orchestrator.control.isolation import Isolation
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.testing.fake import FakeEngine
+from orchestrator.persistence.batch_models import Job, JobQueue, SchedulingPolicy
 from orchestrator.persistence.own_models import ShareUsage
 from orchestrator.persistence.session import Database, DatabaseError
-from orchestrator.persistence.table_models import Job, JobQueue, SchedulingPolicy
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.waiting import wait_for
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from orchestrator.control.store_identity import StoreIdentity, recognise
+from orchestrator.persistence.batch_models import Attempt
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Attempt
 from shared_store.volume.layout import Store, StoreError
 from tests.support.orchestrator.rows import job
 

@@ -16,12 +16,12 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.resources import Resources
+from orchestrator.persistence.batch_models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.gangs import Gangs
 from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.ownership import owner_of, record_owner
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Base, Job, JobQueue, RunRecord
 from shared_store.volume.layout import Run, Store
 from tests.support.orchestrator.rows import job
 

@@ -14,11 +14,11 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.job_counts import ArrayRole, JobCounts, note_rows
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
 from orchestrator.persistence.retention_rows import forget_jobs
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Attempt, Job, Node
 
 QUEUES = [f"queue-{number}" for number in range(60)]
 

@@ -12,9 +12,9 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.persistence import log_groups
+from orchestrator.persistence.batch_models import Node
 from orchestrator.persistence.own_models import LogGroup
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Node
 from tests.support.definitions import container
 from tests.support.orchestrator.rows import job
 

@@ -10,9 +10,9 @@ from sqlalchemy import event, insert
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.job import Status
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Job
 from tests.support.orchestrator.rows import job
 
 ARRAY = "aaaaaaaa-0000-4000-8000-000000000000"

@@ -9,9 +9,9 @@ import pytest
 from sqlalchemy import select, text
 
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS, RetentionRules
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.retention_rows import due, jobs_of_runs
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Job
 from tests.support.orchestrator.rows import job
 
 NOW = 1_000 * A_DAY

@@ -10,8 +10,8 @@ import pytest
 from sqlalchemy import event, select
 
 from orchestrator.domain.job import Status
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
-from orchestrator.persistence.table_models import Attempt, Job, Node
 from tests.support.orchestrator.rows import job
 
 NAMES = [f"job-{number}" for number in range(5)]
