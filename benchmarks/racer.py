@@ -202,7 +202,7 @@ def film(run: Run, path: Path, seconds: float) -> None:
     from worker.telemetry.rollout import Rollout
 
     rollout = Rollout.of(run, {}, 1)
-    camera = picture.Camera(rollout.stage(rollout.task.device), *CLIP)
+    camera = picture.StageCamera(rollout.stage(rollout.task.device), *CLIP)
     stride, frames = picture.pace(rollout.config.control_hz, ".gif")
     steps = max(1, round(seconds * rollout.config.control_hz))
     taken = [camera.take(rows.coordinates[-1]) for rows in itertools.islice(rollout.steps(steps), 0, None, stride)]

@@ -26,7 +26,7 @@ from benchmarks.scale import Bench, ShortEngine, controller, large
 from orchestrator.control.run_store import RunStore
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.api import Gang, Handle, Plan
-from orchestrator.persistence.models import Attempt, Job, Node, RunRecord
+from orchestrator.persistence.batch_models import Attempt, Job, Node, RunRecord
 from shared_store.volume.layout import Store
 
 _TABLES = (Job, Attempt, Node, RunRecord)

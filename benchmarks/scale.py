@@ -28,19 +28,19 @@ from orchestrator.control.bus import Bus
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.control.controller import Controller
 from orchestrator.control.peers import Peers
-from orchestrator.control.run_store import Progress, RunFacts, RunStore
+from orchestrator.control.run_store import ObservedRun, RunContent, RunStore
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.api import Engine, Gang, Handle, Plan, Traits
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job, now
+from orchestrator.persistence.batch_models import Job, now
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import Outcome, write_outcome
+from shared_store.volume.node_outcomes import Outcome, write_outcome
 
 E = TypeVar("E", bound=Engine)
 
@@ -55,9 +55,9 @@ class MemoryStore(RunStore):
     epochs: ClassVar[dict[str, int]] = {}
     """By run."""
 
-    def examine(self, name: str) -> RunFacts:
+    def examine(self, name: str) -> ObservedRun:
         epoch = self.epochs.get(name, 0)
-        return RunFacts(name, missing=not epoch, content={} if epoch else None, epoch=epoch)
+        return ObservedRun(name, missing=not epoch, content={} if epoch else None, epoch=epoch)
 
     def claim(self, name: str, description: Mapping[str, Any], after: int, claim: Claim, texts: Any = ()) -> int:
         self.epochs[name] = after + 1
@@ -66,8 +66,8 @@ class MemoryStore(RunStore):
     def outcomes(self, name: str, job: str, attempt: int, nodes: Sequence[int]) -> Mapping[int, Outcome]:
         return {index: done(index, attempt) for index in nodes}
 
-    def progress(self, name: str, epoch: int) -> Progress:
-        return Progress()
+    def progress(self, name: str, epoch: int) -> RunContent:
+        return RunContent()
 
     def release(self, name: str, epoch: int) -> None:
         """Nothing was claimed."""

@@ -29,7 +29,7 @@ from orchestrator.console import jobs as jobs_page
 from orchestrator.console import live
 from orchestrator.console.live import Recent
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Attempt, Job, JobDefinition, JobQueue, Node
+from orchestrator.persistence.batch_models import Attempt, Job, JobDefinition, JobQueue, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from orchestrator.services.arns import definition_arn

@@ -12,7 +12,7 @@ from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
 from orchestrator.scheduling.decisions import decide
-from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare, Queue, Running, Snapshot, Waiting
+from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare, Queue, RunningGang, Snapshot, Waiting
 
 HOSTS, GPUS = 16, 8
 NOW = 1_800_000_000_000
@@ -27,11 +27,11 @@ def mixed_shapes() -> list[Shape]:
     return [Shape((Resources(12 * gpus, gpus, 32768 * gpus),) * nodes, nodes, 0) for nodes, gpus in each]
 
 
-def cluster() -> tuple[list[Host], list[Running]]:
+def cluster() -> tuple[list[Host], list[RunningGang]]:
     """Sixteen hosts with eight GPUs; each GPU is held by its own gang, which ends within a day."""
     hosts = [Host(f"h{i}", 96, tuple(str(k) for k in range(GPUS)), GPUS * 32768) for i in range(HOSTS)]
     running = [
-        Running(
+        RunningGang(
             job=f"running-{host.name}-{gpu}",
             name="running",
             queue="default",

@@ -35,10 +35,10 @@ from shared_store.volume.metrics import read_metrics
 from worker.evaluation.blocks import SIZE, Blocks
 from worker.evaluation.episodes import play
 from worker.export import export
-from worker.learning.distributed import Placement, connect
+from worker.learning.distributed import RankPlacement, connect
 from worker.learning.loop import Loop
 from worker.learning.trained import load_policy
-from worker.telemetry.picture import Camera
+from worker.telemetry.picture import StageCamera
 from worker.telemetry.recording import Recording
 from worker.telemetry.rollout import Rollout
 
@@ -95,11 +95,11 @@ def watched(loop: Loop) -> list[int]:
         worlds = ("--worlds", str(TAPPED))
         made, said = folder / "live.mcap", folder / "said.txt"
         output = ("--episodes", "1000000", "--output", str(made))
-        recorded = ("worker.telemetry.live", str(run.path), *worlds, *output)
+        recorded = ("worker.telemetry.live_recording", str(run.path), *worlds, *output)
         attended((folder / "live.mcap.partial").exists, said, *recorded)
         mark(STRETCH)
         if find_spec("rerun"):
-            viewed = ("worker.telemetry.view", "--training", str(run.path), "--job", "bench", *worlds)
+            viewed = ("worker.telemetry.live_view", "--training", str(run.path), "--job", "bench", *worlds)
             attended(lambda: "http://" in said.read_text(), said, *viewed)
 
     with tempfile.TemporaryDirectory() as folder:
@@ -141,7 +141,7 @@ def judged(run: Run, worlds: int) -> dict[str, float]:
     count = -(-min(worlds, JUDGED) // SIZE) * SIZE
     rollout = Rollout.of(run, {}, count)
     policies = [load_policy(rollout.checkpoint, str(rollout.task.device)) for _ in range(count // SIZE)]
-    gang = connect(Placement())
+    gang = connect(RankPlacement())
     best: dict[str, float] = {}
     for _ in range(2):  # the first step captures the graph
         started = time.perf_counter()
@@ -164,7 +164,7 @@ def judged(run: Run, worlds: int) -> dict[str, float]:
 def rendered(run: Run) -> dict[str, float]:
     """Pictures per second of the camera of ``muster render``, 640 x 360 px, without the first, which loads kernels."""
     rollout = Rollout.of(run, {}, TAPPED)
-    camera, spent = Camera(rollout.stage(rollout.task.device), 640, 360), list[float]()
+    camera, spent = StageCamera(rollout.stage(rollout.task.device), 640, 360), list[float]()
     for rows in rollout.steps(PICTURES + 1):
         started = time.perf_counter()
         camera.take(rows.coordinates[-1])

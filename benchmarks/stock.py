@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from rsl_rl.runners import OnPolicyRunner
 
-from worker.learning.rsl.environment import TaskVecEnv
+from worker.learning.rsl.vector_environment import TaskVecEnv
 from worker.settings.ppo import PPOConfig
 from worker.tasks.run.task import Task
 

@@ -29,7 +29,7 @@ from benchmarks.stock import stock_runner, stock_seconds
 from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.distributed import Placement, connect
+from worker.learning.distributed import RankPlacement, connect
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.setup import build_task
@@ -56,7 +56,7 @@ def build(
     **train: Any,
 ) -> Loop:
     """The real training loop, on its own store; it saves at the given interval of iterations, by default never."""
-    placement = Placement.from_env(os.environ)
+    placement = RankPlacement.from_env(os.environ)
     name = task.rpartition(":")[2]  # a task given by its path
     run = Store(store).open().run(f"bench-{name}-{worlds}-{seed}".lower())
     section = {"task": task, "worlds": worlds, "iterations": 10**9, "seed": seed, **train}

@@ -30,11 +30,11 @@ from benchmarks.training import build
 from shared_store.volume.layout import Run
 from tests.support.browser import empty_page
 from worker.telemetry import screen
-from worker.telemetry.page import Page
+from worker.telemetry.live_view import TrainingView
+from worker.telemetry.page import ViewerPage
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Rows
 from worker.telemetry.tap import Tap
-from worker.telemetry.view import Training
 
 WARM = 20.0
 """Seconds for the page to start and draw its first frames."""
@@ -97,7 +97,7 @@ def train(task: str, worlds: int, folder: Path) -> None:
         loop.train()
 
 
-class Timed(Training):
+class Timed(TrainingView):
     """The view of a training, which records when it has read a row."""
 
     read = 0
@@ -161,8 +161,8 @@ def measure(task: str, worlds: int, seconds: float, folder: Path) -> dict[str, A
         (run,) = (Run(each) for each in (folder / "store" / "runs").iterdir())
         stop, found = list[int](), dict[str, Any]()
 
-        def start() -> Page:
-            page = Page(None, "256MB")
+        def start() -> ViewerPage:
+            page = ViewerPage(None, "256MB")
             threading.Thread(target=look_on, args=(page.url, seconds, stop, found)).start()
             return page
 

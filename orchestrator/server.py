@@ -41,8 +41,8 @@ from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.secrets import Secrets, SecretsError
 from orchestrator.home import HomeLock
 from orchestrator.persistence.access_keys import KeyStore
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.home_files import move_in
-from orchestrator.persistence.models import Job
 from orchestrator.persistence.own_secrets import CONSOLE, OwnSecrets
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.persistence.urls import shown

@@ -3,6 +3,7 @@
 from shared_store import keep_old_names
 
 OLD_NAMES = {
+    "worker.deploy.model": "worker.deploy.model_file",
     "worker.learning.ppo.settings": "worker.settings.ppo",
     "worker.learning.rsl.settings": "worker.settings.rsl_rl",
     "worker.learning.sac.settings": "worker.settings.sac",
@@ -19,7 +20,7 @@ OLD_NAMES = {
     "worker.tasks.lift": "worker.tasks.library.lift",
     "worker.tasks.overrides": "worker.settings.overrides",
     "worker.tasks.racer": "racer.car.task",
-    "worker.tasks.rsl_rl_env": "worker.learning.rsl.environment",
+    "worker.tasks.rsl_rl_env": "worker.learning.rsl.vector_environment",
     "worker.tasks.task": "worker.tasks.run.task",
 }
 """Names in the documentation before the modules moved into rooms."""

@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from shared_store.contract import plugins
-from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.node_outcomes import EX_TEMPFAIL
 from shared_store.volume.run_settings import merged
 from shared_store.volume.texts import beside, keep
 from worker.learning.job import Job, StopRequest, configure, end_startup, run_command, user_errors
@@ -36,18 +36,18 @@ def main(kind: str = "evaluate") -> int:
     run, section = job.named_run(), plugins.sections().get(kind)
     rules: EvaluationRules | None = plugins.load(section.rules) if section else None
     episodes = job.setting(*rules.count if rules else ("episodes", EPISODES))
-    from worker.learning.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import REPORT_SECONDS, RankPlacement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
     with user_errors():
-        placement = Placement.from_env(os.environ)
+        placement = RankPlacement.from_env(os.environ)
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     from shared_store.volume.evaluations import lines
     from worker.evaluation.blocks import SIZE, Blocks
     from worker.evaluation.episodes import Stopped, play
     from worker.evaluation.evaluation import result_of
-    from worker.learning.algorithm import Share
+    from worker.learning.algorithm import WorldShare
     from worker.learning.randomness import held_out_seed, seed_generators
     from worker.learning.setup import begin_as_trained, build_task, check_contract
     from worker.learning.trained import choose_checkpoint, load_policies
@@ -66,11 +66,11 @@ def main(kind: str = "evaluate") -> int:
     seed_generators(seed)
     size = episodes if rules else SIZE  # by rules, each episode has a world, and there are no further ones beside them
     blocks = math.ceil(min(job.setting("worlds", WORLDS) * gang.size, episodes) / size)
-    dealt = Share.of(gang.rank, gang.size, max(blocks, gang.size))
-    share, total = Share(dealt.first * size, dealt.count * size, dealt.total * size), dealt.total * size
+    dealt = WorldShare.of(gang.rank, gang.size, max(blocks, gang.size))
+    share, total = WorldShare(dealt.first * size, dealt.count * size, dealt.total * size), dealt.total * size
 
     def build(first: int) -> Task:
-        task = build_task(task_type, config, Share(first + share.first, share.count, total), gang, seed)
+        task = build_task(task_type, config, WorldShare(first + share.first, share.count, total), gang, seed)
         begin_as_trained(task, checkpoint)
         return task
 

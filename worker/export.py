@@ -54,15 +54,15 @@ def main() -> int:
         return 0
     run = job.named_run()
     episodes, worlds = job.setting("episodes", 16, least=0), job.setting("worlds", 16)
-    from worker.learning.distributed import Placement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import RankPlacement, connect, require_gpus, use_cpu_threads
     from worker.learning.trained import find_checkpoint
 
     checkpoint = find_checkpoint(run, job.section.get("checkpoint"))
     use_cpu_threads(os.environ)
     with user_errors():
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), 0)
-    gang = connect(Placement())
-    from worker.learning.algorithm import Share
+    gang = connect(RankPlacement())
+    from worker.learning.algorithm import WorldShare
     from worker.learning.randomness import held_out_seed, seed_generators
     from worker.learning.setup import begin_as_trained, build_task
     from worker.tasks import find_task
@@ -73,7 +73,7 @@ def main() -> int:
     config = configure(task_type, facts["train"])
     seed = held_out_seed(facts["train"].get("seed", 0))
     seed_generators(seed)
-    task = build_task(task_type, config, Share.of(0, 1, worlds), gang, seed)
+    task = build_task(task_type, config, WorldShare.of(0, 1, worlds), gang, seed)
     begin_as_trained(task, checkpoint)
     target = export(run, checkpoint, task, -(-episodes // worlds), job.section)
     print(f"exported: {target}", flush=True)

@@ -47,7 +47,7 @@ def main() -> int:
     stride, frames = picture.pace(rate, ending)
     if ending == ".png":
         stride = max(1, steps // picture.MOMENTS)
-    camera = picture.Camera(stage, width, height)
+    camera = picture.StageCamera(stage, width, height)
     taken: list[np.ndarray] = []
     spent = 0.0
     for number, rows in enumerate(rollout.steps(steps)):

@@ -18,7 +18,7 @@ import warp as wp
 
 from worker.settings.task import TaskConfig
 from worker.simulation.robot import Robot
-from worker.simulation.robot_comparison import Difference
+from worker.simulation.robot_comparison import RobotDifference
 from worker.simulation.robot_connections import Ends, equality_ends, tendon_ends
 from worker.simulation.robot_elements import kind_of, name_of, short, word_of
 from worker.simulation.robot_reading import AnotherRobot, Reading
@@ -229,7 +229,7 @@ def _actuator(
     }
 
 
-def _difference(difference: Difference) -> dict[str, str]:
+def _difference(difference: RobotDifference) -> dict[str, str]:
     return {
         "element": difference.element,
         "field": difference.field,
@@ -246,7 +246,7 @@ def draw(robot: Robot, path: Path) -> None:
             robot.add_to(builder)
 
     stage = Stage(Alone, TaskConfig(), 1)
-    image = picture.Camera(stage, *PICTURE).take(np.array([stage.model.joint_q.numpy()]))
+    image = picture.StageCamera(stage, *PICTURE).take(np.array([stage.model.joint_q.numpy()]))
     picture.write(path, picture.encode([image], ".png", 1.0))
 
 

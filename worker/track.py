@@ -1,6 +1,6 @@
 """Sends a run's metrics to a tracking service: a process of its own beside the main rank, which follows what the run's files say.
 
-``python -m worker.track`` is started by :class:`worker.telemetry.tracking.Tracking` for each service that the job names. It reads one
+``python -m worker.track`` is started by :class:`worker.telemetry.tracking_processes.Tracking` for each service that the job names. It reads one
 JSON order on standard input, later how the training ended; its lines on standard output, JSON too, are for the log. Whatever a service
 does, the training neither waits nor fails: the metrics are in the store, and are sent once the service takes them.
 
@@ -28,7 +28,7 @@ from shared_store.volume.evaluations import list_evaluations
 from shared_store.volume.files import read_json, write_json
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import MetricsHistory
-from worker.telemetry.services import SERVICES, Ending, Refused, Service, Tracked, one_line, without_key
+from worker.telemetry.services import SERVICES, Service, ServiceRefused, Tracked, TrainingEnd, one_line, without_key
 
 LOOK_SECONDS = 2.0
 """Between two looks at the metrics."""
@@ -139,7 +139,7 @@ class Sender:
     def finish(self, outcome: str) -> None:
         """Send the end: evaluation and pictures of a training that is done. Raises whatever the service does."""
         figures, files = _results(self._run) if outcome == "finished" else ({}, [])
-        self._service.finish(Ending(outcome, self._sent or 0, figures, files))
+        self._service.finish(TrainingEnd(outcome, self._sent or 0, figures, files))
 
 
 def _results(run: Run) -> tuple[dict[str, float], list[Path]]:
@@ -196,7 +196,7 @@ def beside_a_rank() -> None:
     service = SERVICES[order["service"]](tracked_of(run, train, order["facts"]), order["settings"])
     try:
         service.prepare()
-    except Refused as refused:
+    except ServiceRefused as refused:
         tell(refused=str(refused))
         return
     tell(ready=True)
@@ -269,7 +269,7 @@ def afterwards(directory: str, kind: str) -> int:
     service = SERVICES[kind](tracked_of(run, spec["train"], {}), settings)
     try:
         service.prepare()
-    except Refused as refused:
+    except ServiceRefused as refused:
         return _fail(f"{kind}: {refused}")
     turn = Turn(run, kind)
     try:

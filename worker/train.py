@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from worker.learning.job import Job, StopRequest, run_command, user_errors
 from worker.settings.errors import UserError
-from worker.telemetry.tracking import Tracking
+from worker.telemetry.tracking_processes import Tracking
 
 if TYPE_CHECKING:
     from worker.learning.hooks import Hook
@@ -29,11 +29,11 @@ def main() -> int:
 
 
 def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
-    from worker.learning.distributed import REPORT_SECONDS, Placement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import REPORT_SECONDS, RankPlacement, connect, require_gpus, use_cpu_threads
 
     use_cpu_threads(os.environ)
     with user_errors():
-        placement = Placement.from_env(os.environ)
+        placement = RankPlacement.from_env(os.environ)
         require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
     gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
     if not isinstance(job.section.get("task"), str):
@@ -44,7 +44,7 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
         task_type = find_task(job.section["task"])
     from worker.learning.leaving import train
     from worker.learning.loop import Loop
-    from worker.learning.memory import within_memory
+    from worker.learning.memory_estimate import within_memory
     from worker.learning.setup import total_worlds
     from worker.learning.training import Training
 

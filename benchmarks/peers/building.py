@@ -10,7 +10,7 @@ from typing import Any
 
 from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
-from worker.learning.distributed import Placement, connect
+from worker.learning.distributed import RankPlacement, connect
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
 from worker.learning.training import Training
@@ -59,7 +59,7 @@ def build_loop(asked: Mapping[str, Any], store: Path, loop_type: type[Loop] = Lo
         UserError: A setting that the task or the algorithm refuses.
     """
     task_type, settings = limited(asked["task"], asked["limits"])
-    placement = Placement.from_env(os.environ)
+    placement = RankPlacement.from_env(os.environ)
     run = Store(store).open().run(f"peers-{asked['task']}-{asked['worlds']}-{asked['seed']}".lower())
     run.create({"run": run.name})
     raise_epoch(run, 1)

@@ -21,7 +21,7 @@ from orchestrator.home import muster_home
 from shared_store.contract.error_text import counted
 
 if TYPE_CHECKING:
-    from orchestrator.engines.aws_batch.stack import Event, Stack
+    from orchestrator.engines.aws_batch.stack import Stack, StackEvent
 
 NameOption = Annotated[str, typer.Option("--stack-name", help="Name of the CloudFormation stack.")]
 RegionOption = Annotated[str | None, typer.Option(help="AWS region; by default that of your AWS configuration.")]
@@ -152,7 +152,7 @@ def status(
     print_rows(table)
 
 
-def _follow(stack: Stack, made: str, began: float) -> list[Event]:
+def _follow(stack: Stack, made: str, began: float) -> list[StackEvent]:
     """Print the stack's events until it is stable."""
     events = []
     for event in stack.follow(made, began):

@@ -12,7 +12,7 @@ from typing import Any
 import typer
 from typer.models import CommandInfo
 
-from orchestrator.cli.misuse import Group
+from orchestrator.cli.misuse import CommandGroup
 from shared_store.contract.plugins import Command, plugins
 from shared_store.contract.plugins import load as load_part
 
@@ -159,7 +159,7 @@ def load(name: str) -> Any:
     return command
 
 
-class Catalogue(Group):
+class Catalogue(CommandGroup):
     """A group that lists placeholders and runs the real commands."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:

@@ -16,7 +16,7 @@ from orchestrator.cli.recordings import OverwriteOption, refuse_existing
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError
-from shared_store.volume.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, versus
+from shared_store.volume.comparison import COLUMNS, ComparedRun, RunGroup, facts_of, grouped, sentence, versus
 
 _PAGE = 10_000
 
@@ -97,7 +97,7 @@ def _all_runs(client: Client) -> list[str]:
     return names
 
 
-def _facts(client: Client, name: str) -> RunFacts:
+def _facts(client: Client, name: str) -> ComparedRun:
     """The data of a run to compare. Raises ApiError if it does not exist."""
     described = client.get(f"/api/runs/{named(name)}")
     records: list[dict[str, Any]] = []
@@ -117,7 +117,7 @@ def _check_output(output: Path | None) -> None:
         raise UsageError(f"-o {output}: {output.parent} is not a directory")
 
 
-def _draw(groups: Sequence[Group], output: Path) -> None:
+def _draw(groups: Sequence[RunGroup], output: Path) -> None:
     """Raises UsageError."""
     try:
         draw(groups, output)

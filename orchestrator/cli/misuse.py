@@ -23,7 +23,7 @@ _EXPECTED = {
 }
 
 
-class Group(TyperGroup):
+class CommandGroup(TyperGroup):
     """A group of commands that refuses an unknown one with the nearest name."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -35,7 +35,7 @@ class Group(TyperGroup):
 
 def make_group(about: str, epilog: str) -> typer.Typer:
     """A group of commands that prints its help without a subcommand."""
-    return typer.Typer(cls=Group, no_args_is_help=True, rich_markup_mode="rich", help=about, epilog=epilog)
+    return typer.Typer(cls=CommandGroup, no_args_is_help=True, rich_markup_mode="rich", help=about, epilog=epilog)
 
 
 def told(error: Any, commands: Sequence[str]) -> str:

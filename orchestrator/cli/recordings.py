@@ -66,7 +66,7 @@ def record(
     if recover is not None:
         if source is not None or output is not None:
             raise UsageError("--recover: give only the truncated file; the recovered one is written beside it")
-        raise typer.Exit(run_worker("worker.telemetry.live", "--recover", str(recover)))
+        raise typer.Exit(run_worker("worker.telemetry.live_recording", "--recover", str(recover)))
     if source is None:
         raise UsageError("give a run or a job, and -o FILE.mcap; or --recover FILE.mcap.partial")
     if output is None:
@@ -78,7 +78,9 @@ def record(
         if live is not None:
             options = {"--worlds": str(worlds), "--episodes": str(episodes), "--output": str(output.absolute())}
             given = [text for pair in options.items() for text in pair]
-            raise typer.Exit(run_worker("worker.telemetry.live", run["path"], "--job", live, *given, run=run["path"]))
+            raise typer.Exit(
+                run_worker("worker.telemetry.live_recording", run["path"], "--job", live, *given, run=run["path"])
+            )
         section = Record(
             run=run["run"],
             checkpoint=checkpoint_of(client, run, source),

@@ -82,7 +82,7 @@ def view(
             raise UsageError(f"{source}: give a recording with the ending .mcap, .mcap.partial or .rrd")
         if episodes is not None:
             raise UsageError("--episodes: only the policy of a RUN takes it; a recording is shown whole")
-        raise typer.Exit(run_worker("worker.telemetry.view", "--file", str(path), *given))
+        raise typer.Exit(run_worker("worker.telemetry.live_view", "--file", str(path), *given))
     with controller(store, cpus) as connect:
         client = connect()
         run, live = source_of(client, source)
@@ -96,12 +96,14 @@ def view(
                     f"--episodes: {source} is training; to see its newest policy: muster view {run['run']}"
                 )
             raise typer.Exit(
-                run_worker("worker.telemetry.view", "--training", run["path"], "--job", live, *given, run=run["path"])
+                run_worker(
+                    "worker.telemetry.live_view", "--training", run["path"], "--job", live, *given, run=run["path"]
+                )
             )
         given += ["--checkpoint", str(checkpoint_of(client, run, source))]
         given += ["--episodes", str(episodes)] if episodes is not None else []
         given += ["--accept-changed-robot"] if accept_changed_robot else []
-        raise typer.Exit(run_worker("worker.telemetry.view", "--policy", run["path"], *given, run=run["path"]))
+        raise typer.Exit(run_worker("worker.telemetry.live_view", "--policy", run["path"], *given, run=run["path"]))
 
 
 def _has_display() -> bool:

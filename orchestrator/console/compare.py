@@ -20,7 +20,17 @@ from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run, visible_runs
 from orchestrator.services.permissions import Operation
 from shared_store.contract.error_text import nearest
-from shared_store.volume.comparison import COLUMNS, Group, RunFacts, facts_of, grouped, sentence, spaced, span, versus
+from shared_store.volume.comparison import (
+    COLUMNS,
+    ComparedRun,
+    RunGroup,
+    facts_of,
+    grouped,
+    sentence,
+    spaced,
+    span,
+    versus,
+)
 from shared_store.volume.metrics import sampled
 
 router = page_router("run", stored=True)
@@ -81,7 +91,7 @@ def curves(
     return {"x": at, "xLabel": "environment steps", "lines": [_line(group, metric, at) for group in groups]}
 
 
-def _line(group: Group, metric: str, at: Sequence[float]) -> dict[str, Any]:
+def _line(group: RunGroup, metric: str, at: Sequence[float]) -> dict[str, Any]:
     found = {steps: (mean, spread, count) for steps, mean, spread, count in group.curve(metric, at)}
     values = [found.get(steps) for steps in at]
     line: dict[str, Any] = {"name": group.label, "y": [number(each[0]) if each else None for each in values]}
@@ -116,14 +126,14 @@ def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
     return list(chosen)
 
 
-def _groups(request: Request, names: Sequence[str]) -> list[Group]:
+def _groups(request: Request, names: Sequence[str]) -> list[RunGroup]:
     """The runs in groups; pages of the same runs share the result. Raises ClientError for a run that does not exist, or that the caller may not see."""
     actor = actor_of(request)
     key = (id(controller_of(request)), actor, tuple(names))
     return _recent.get(key, lambda: grouped(map(partial(_facts, request), names)))
 
 
-def _facts(request: Request, name: str) -> RunFacts:
+def _facts(request: Request, name: str) -> ComparedRun:
     described = run_routes.run_detail(request, name)
     run = permitted_run(controller_of(request), actor_of(request), name, Operation.READ_METRICS)
     try:
@@ -134,7 +144,7 @@ def _facts(request: Request, name: str) -> RunFacts:
     return facts_of(described, records, checkpoints, run_routes.run_evaluations(request, name))
 
 
-def _metrics(groups: Sequence[Group]) -> list[str]:
+def _metrics(groups: Sequence[RunGroup]) -> list[str]:
     """The metrics for which at least one run has a number."""
     newest = [run.records[-1] for group in groups for run in group.runs if run.records]
     return sorted({name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS)

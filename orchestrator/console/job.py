@@ -19,7 +19,7 @@ from orchestrator.console.job_config import before_it, code_of, differences
 from orchestrator.console.job_facts import attempts_of, checkpoints_of, child_of, facts_of
 from orchestrator.console.job_log import ChosenLog, LiveLog
 from orchestrator.console.job_view import is_near, views
-from orchestrator.console.live import Event, Recent, Rows, last_id, stream
+from orchestrator.console.live import Recent, ServerSentEvent, TableRows, last_id, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.run_files import File, files_of
@@ -135,30 +135,30 @@ class _Feed:
     iteration: int | None
     """The last iteration of its curves; None: it has none yet, and the next is the newest."""
     facts: dict[str, Any] = field(default_factory=dict)
-    attempts: Rows = field(default_factory=Rows)
-    checkpoints: Rows = field(default_factory=Rows)
+    attempts: TableRows = field(default_factory=TableRows)
+    checkpoints: TableRows = field(default_factory=TableRows)
     is_over: bool = False
 
-    def changes(self) -> Sequence[Event] | None:
+    def changes(self) -> Sequence[ServerSentEvent] | None:
         """The events since the last look; None once the job is over and all its events have been sent."""
         if self.is_over:
             return None
         seen = self.look()  # before the log: nothing is written after the end
-        events: list[Event] = []
+        events: list[ServerSentEvent] = []
         if changed := {name: value for name, value in seen["facts"].items() if self.facts.get(name) != value}:
-            events.append(Event("facts", changed))
+            events.append(ServerSentEvent("facts", changed))
         self.facts = seen["facts"]
         for name, rows in (("attempts", self.attempts), ("checkpoints", self.checkpoints)):
-            events += [Event(name, each.data) for each in rows.changes(seen[name], {})]
+            events += [ServerSentEvent(name, each.data) for each in rows.changes(seen[name], {})]
         if self.facts["run"]:
             events += self._curves()
         lines, is_behind = self.log.changes(is_last=not self.facts["open"])
         events += [lines] if lines else []
         self.is_over = not self.facts["open"] and not is_behind
         given = json.dumps({"i": self.iteration, "l": self.log.places}, separators=(",", ":"))
-        return [Event(each.name, each.data, given) for each in events]
+        return [ServerSentEvent(each.name, each.data, given) for each in events]
 
-    def _curves(self) -> list[Event]:
+    def _curves(self) -> list[ServerSentEvent]:
         """New iterations; ``again`` where an attempt went back behind the page's last iteration, or the page has missed too many."""
         newest = max((each["iteration"] for each in sampled(self.run, 2)), default=0)
         had, self.iteration = self.iteration, newest
@@ -166,10 +166,10 @@ class _Feed:
             return []
         records = history_of(self.run).after(had, _RECORDS + 1) if newest > had else []
         if newest < had or len(records) > _RECORDS:
-            return [Event("metrics", {"again": True})]
+            return [ServerSentEvent("metrics", {"again": True})]
         # not ``newest``: one may have been written since that look, or a long history is not read to its end yet
         self.iteration = records[-1]["iteration"] if records else had
-        return [Event("metrics", columns(records, ["*"]))] if records else []
+        return [ServerSentEvent("metrics", columns(records, ["*"]))] if records else []
 
 
 def _had(given: str) -> tuple[int | None, dict[str, int] | None]:

@@ -14,7 +14,7 @@ from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import short_id
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.services import clone as clones
 from orchestrator.services import derived_jobs, models
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose

@@ -12,7 +12,7 @@ from sqlalchemy import select
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.services import runs
 from orchestrator.services.context import permitted_run
 from orchestrator.services.damaged_rows import reading

@@ -12,7 +12,7 @@ from orchestrator.api.http.answer_streams import PIECE
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.log_stream import positions_of
 from orchestrator.api.native.routes import permitted_job
-from orchestrator.console.live import Event
+from orchestrator.console.live import ServerSentEvent
 from orchestrator.console.routing import page_router
 from orchestrator.control.log_hub import LogHub
 from orchestrator.domain.errors import ClientError
@@ -117,7 +117,7 @@ class LiveLog(AbstractContextManager["LiveLog"]):
     def wake(self) -> None:
         """The page looks at intervals anyway."""
 
-    def changes(self, is_last: bool) -> tuple[Event | None, bool]:
+    def changes(self, is_last: bool) -> tuple[ServerSentEvent | None, bool]:
         """The event ``lines`` or ``window``, and whether there is more already; ``is_last``: the job is over, so that the files have all.
 
         ``window``: the page has missed so much that it gets the last lines alone; ``skipped`` are the bytes before them. Raises OSError.
@@ -130,7 +130,9 @@ class LiveLog(AbstractContextManager["LiveLog"]):
                 last = lines_before(self.chosen, end)
                 begun = sum(max(0, last.first.get(key, 0) - self.places.get(key, 0)) for key in end)
                 self._view, self.places = LogView(self.chosen, dict(end), PIECE), dict(end)
-                return Event("window", {**_written(last), "skipped": begun}), False
+                return ServerSentEvent("window", {**_written(last), "skipped": begun}), False
             lines = self._view.poll()
         self.places = dict(self._view.offsets)
-        return Event("lines", {"lines": written(lines), "last": self.places}) if lines else None, self._view.behind
+        return ServerSentEvent(
+            "lines", {"lines": written(lines), "last": self.places}
+        ) if lines else None, self._view.behind

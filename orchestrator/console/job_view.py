@@ -40,7 +40,7 @@ _AT = "the view is at "
 
 
 @dataclass(frozen=True)
-class State:
+class JobViewState:
     """The state of one job's view; at most one field is filled."""
 
     is_starting: bool = False
@@ -58,7 +58,7 @@ class State:
 class _View:
     job: str
     command: list[str]
-    state: State = field(default_factory=lambda: State(is_starting=True))
+    state: JobViewState = field(default_factory=lambda: JobViewState(is_starting=True))
     seen: float = field(default_factory=time.monotonic)
     process: subprocess.Popen[bytes] | None = None
     is_wanted: bool = True
@@ -80,12 +80,12 @@ class _View:
         for raw in process.stdout:
             line = raw.decode(errors="replace").strip()
             if line.startswith(_AT):
-                self.state = State(url=line.removeprefix(_AT))
+                self.state = JobViewState(url=line.removeprefix(_AT))
             elif line:
                 said.append(line)
         code = process.wait()
         last = said[-1].removeprefix("muster: ") if said else f"exit code {code}"
-        self.state = State(problem=last[:500] if self.is_wanted and code else "")
+        self.state = JobViewState(problem=last[:500] if self.is_wanted and code else "")
 
     def _watch(self, process: subprocess.Popen[bytes]) -> None:
         while process.poll() is None:
@@ -106,11 +106,11 @@ class Views:
         self._lock = threading.Lock()
         self._views: dict[str, _View] = {}
 
-    def state(self, job: str, *, is_seen: bool = False) -> State:
+    def state(self, job: str, *, is_seen: bool = False) -> JobViewState:
         """The state of the job's view; ``is_seen``: a visitor has the job's page open."""
         view = self._views.get(job)
         if view is None:
-            return State()
+            return JobViewState()
         if is_seen:
             view.seen = time.monotonic()
         return view.state
@@ -147,7 +147,16 @@ def show(request: Request, reference: str) -> Response:
     if find_spec("newton") is None:
         raise ClientError("the live view needs the simulation on this machine: pip install 'muster[worker]'", CONFLICT)
     run = permitted_run(controller_of(request), actor_of(request), detail["run"], Operation.READ_RUN)
-    command = [sys.executable, "-P", "-m", "worker.telemetry.view", "--training", str(run.path), "--job", detail["id"]]
+    command = [
+        sys.executable,
+        "-P",
+        "-m",
+        "worker.telemetry.live_view",
+        "--training",
+        str(run.path),
+        "--job",
+        detail["id"],
+    ]
     views.start(detail["id"], [*command, "--port", "0", "--framed-by", _origin(request)])
     return done(request, f"/jobs/{detail['id']}", "the live view starts")
 

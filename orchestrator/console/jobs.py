@@ -14,7 +14,7 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
 from orchestrator.console import formats as words
 from orchestrator.console.forms import Form, Question, done, sent_form
-from orchestrator.console.live import Event, Recent, Rows, stream
+from orchestrator.console.live import Recent, ServerSentEvent, TableRows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.controller import Controller
@@ -94,9 +94,9 @@ def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
 def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Response:
     """The changes in a window of the table, as events."""
     actor = actor_of(request)
-    table, look = Rows(), partial(_window, controller_of(request), actor, choice)
+    table, look = TableRows(), partial(_window, controller_of(request), actor, choice)
 
-    def changes() -> Sequence[Event]:
+    def changes() -> Sequence[ServerSentEvent]:
         return table.changes(*look())
 
     return stream(request, changes)

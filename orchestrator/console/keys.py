@@ -10,7 +10,7 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.key_routes import create_key, delete_key, is_writable, list_keys
 from orchestrator.console import formats as words
 from orchestrator.console.forms import Form, Question, done, sent_form
-from orchestrator.console.live import Event, Rows, stream
+from orchestrator.console.live import ServerSentEvent, TableRows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.services.arns import here
@@ -37,9 +37,9 @@ def keys(request: Request) -> Response:
 @router.get("/keys/stream")
 def keys_stream(request: Request) -> Response:
     """The changes in the list, as events."""
-    table = Rows()
+    table = TableRows()
 
-    def changes() -> Sequence[Event]:
+    def changes() -> Sequence[ServerSentEvent]:
         return table.changes(_rows(request), {})
 
     return stream(request, changes, _INTERVAL)

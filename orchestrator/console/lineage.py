@@ -13,7 +13,7 @@ _GAP = (60, 16)
 
 
 @dataclass(frozen=True)
-class Box:
+class Vertex:
     """A run or a version in the drawing; x and y of its upper left corner [px]."""
 
     title: str
@@ -30,7 +30,7 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Line:
+class Edge:
     """From the right of one box to the left of another [px], with the checkpoint between them."""
 
     x1: int
@@ -41,11 +41,11 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class LineageGraph:
     """The whole graph."""
 
-    boxes: Sequence[Box]
-    lines: Sequence[Line]
+    boxes: Sequence[Vertex]
+    lines: Sequence[Edge]
     width: int
     height: int
 
@@ -67,7 +67,7 @@ Parent = Callable[[str], Mapping[str, Any] | None]
 
 def drawing(
     versions: Sequence[Mapping[str, Any]], chosen: int, parent_of: Parent, link: Callable[[str], str] = lambda run: ""
-) -> Drawing:
+) -> LineageGraph:
     """The graph of a model.
 
     Args:
@@ -114,19 +114,19 @@ def _level(nodes: Mapping[str, _Node], key: str, above: tuple[str, ...]) -> int:
     return node.level
 
 
-def _placed(nodes: Mapping[str, _Node]) -> Drawing:
+def _placed(nodes: Mapping[str, _Node]) -> LineageGraph:
     rows: dict[int, int] = {}
-    boxes: dict[str, Box] = {}
+    boxes: dict[str, Vertex] = {}
     for key, node in nodes.items():
         row = rows[node.level] = rows.get(node.level, -1) + 1
         x, y = node.level * (_BOX[0] + _GAP[0]), row * (_BOX[1] + _GAP[1])
-        boxes[key] = Box(node.title, node.about, node.link, x, y, node.is_chosen)
+        boxes[key] = Vertex(node.title, node.about, node.link, x, y, node.is_chosen)
     lines = [
-        Line(boxes[parent].x + _BOX[0], boxes[parent].y + 22, boxes[key].x, boxes[key].y + 22, f"@{checkpoint}")
+        Edge(boxes[parent].x + _BOX[0], boxes[parent].y + 22, boxes[key].x, boxes[key].y + 22, f"@{checkpoint}")
         for key, node in nodes.items()
         for parent, checkpoint in node.parents.items()
         if parent in boxes
     ]
     width = max((box.x for box in boxes.values()), default=0) + _BOX[0]
     height = max((box.y for box in boxes.values()), default=0) + _BOX[1]
-    return Drawing(list(boxes.values()), lines, width + 2, height + 2)
+    return LineageGraph(list(boxes.values()), lines, width + 2, height + 2)

@@ -40,7 +40,7 @@ _Value = TypeVar("_Value")
 
 
 @dataclass(frozen=True)
-class Event:
+class ServerSentEvent:
     """One event: its name, its data (JSON), and its id, which a browser sends when it reconnects."""
 
     name: str
@@ -48,7 +48,7 @@ class Event:
     id: str | None = None
 
 
-Look = Callable[[], Sequence[Event] | None]
+Look = Callable[[], Sequence[ServerSentEvent] | None]
 """The events since the last call; None at the end of the stream. Runs in a thread, where the database may be used."""
 
 
@@ -87,7 +87,7 @@ def stream(
 
 class _Live(Following):
     def refusal(self, message: str) -> Response:
-        trouble = _written(Event("trouble", f"{message}, and this one becomes live"))
+        trouble = _written(ServerSentEvent("trouble", f"{message}, and this one becomes live"))
         return Response(format_sse_event(retry=30_000, comment="Muster") + trouble, media_type=self.media_type)
 
 
@@ -115,19 +115,19 @@ async def _events(
                     (found,) = answer
                 elif goes_on():
                     is_troubled = True
-                    yield _written(Event("trouble", _SILENT))
+                    yield _written(ServerSentEvent("trouble", _SILENT))
                 else:
                     return
         except (ClientError, Unavailable, DamagedFile, OSError) as error:
             is_troubled = True
-            yield _written(Event("trouble", str(error)))
+            yield _written(ServerSentEvent("trouble", str(error)))
             await asyncio.sleep(5 * interval)
             continue
         if is_troubled:
             is_troubled = False
-            yield _written(Event("trouble", ""))
+            yield _written(ServerSentEvent("trouble", ""))
         if found is None:
-            yield _written(Event("end", None))
+            yield _written(ServerSentEvent("end", None))
             return
         if found:
             yield b"".join(map(_written, found))
@@ -138,12 +138,12 @@ async def _events(
         await asyncio.sleep(interval)
 
 
-def _written(event: Event) -> bytes:
+def _written(event: ServerSentEvent) -> bytes:
     # ASCII: a line separator of Unicode would be one of the protocol's for some readers
     return format_sse_event(data_str=json.dumps(event.data, separators=(",", ":")), event=event.name, id=event.id)
 
 
-class Rows:
+class TableRows:
     """The rows of a live table, and their changes since the last look, by key and field."""
 
     def __init__(self, name: str = "rows") -> None:
@@ -153,7 +153,7 @@ class Rows:
         self._shown: dict[str, Mapping[str, Any]] = {}
         self._totals: Mapping[str, Any] = {}
 
-    def changes(self, rows: Mapping[str, Mapping[str, Any]], totals: Mapping[str, Any]) -> list[Event]:
+    def changes(self, rows: Mapping[str, Mapping[str, Any]], totals: Mapping[str, Any]) -> list[ServerSentEvent]:
         """One event, or none: the order of the keys, where it changed, and the changed fields of each row; ``totals`` of the whole page.
 
         Args:
@@ -170,7 +170,7 @@ class Rows:
         if totals != self._totals:
             data["totals"] = totals
         self._order, self._shown, self._totals = order, dict(rows), totals
-        return [Event(self._name, data)] if data else []
+        return [ServerSentEvent(self._name, data)] if data else []
 
 
 def _difference(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> Mapping[str, Any]:

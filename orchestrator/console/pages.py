@@ -39,7 +39,7 @@ THEME = "muster-theme"
 
 
 @dataclass(frozen=True)
-class Entry:
+class NavigationEntry:
     """An entry of the navigation; shown once its page exists."""
 
     label: str
@@ -47,13 +47,13 @@ class Entry:
 
 
 NAVIGATION = (
-    Entry("Jobs", "/"),
-    Entry("Runs", "/runs"),
-    Entry("Models", "/models"),
-    *(Entry(label, path) for plugin in plugins().values() for label, path in plugin.navigation),
-    Entry("Queues & compute", "/queues"),
-    Entry("Keys", "/keys"),
-    Entry("Submit", "/submit"),
+    NavigationEntry("Jobs", "/"),
+    NavigationEntry("Runs", "/runs"),
+    NavigationEntry("Models", "/models"),
+    *(NavigationEntry(label, path) for plugin in plugins().values() for label, path in plugin.navigation),
+    NavigationEntry("Queues & compute", "/queues"),
+    NavigationEntry("Keys", "/keys"),
+    NavigationEntry("Submit", "/submit"),
 )
 
 
@@ -123,7 +123,7 @@ def session(request: Request) -> str:
     return given if access.session(given) is not None else ""
 
 
-def _navigation(request: Request) -> list[Entry]:
+def _navigation(request: Request) -> list[NavigationEntry]:
     """The pages that are there, without those that would be refused."""
     actor = actor_of(request)
     refused = set() if may_change(actor) else {"/submit"}

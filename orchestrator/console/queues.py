@@ -13,7 +13,7 @@ from fastapi import Query, Request, Response
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.queue_overview import FIRST, overview
 from orchestrator.console import formats as words
-from orchestrator.console.live import Event, Recent, Rows, stream
+from orchestrator.console.live import Recent, ServerSentEvent, TableRows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.controller import Controller
@@ -50,9 +50,9 @@ def queues_stream(request: Request, queue: str = Query(default="", max_length=12
     """The changes in the tables, as events."""
     actor = actor_of(request)
     look = partial(_tables, controller_of(request), actor, queue)
-    known = {name: Rows(name) for name in _ROWS}
+    known = {name: TableRows(name) for name in _ROWS}
 
-    def changes() -> Sequence[Event]:
+    def changes() -> Sequence[ServerSentEvent]:
         return [event for name, rows in look().items() for event in known[name].changes(rows, {})]
 
     return stream(request, changes)

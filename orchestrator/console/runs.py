@@ -12,7 +12,7 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import run_routes
 from orchestrator.console import formats as words
 from orchestrator.console.curves import number
-from orchestrator.console.live import Event, Recent, Rows, stream
+from orchestrator.console.live import Recent, ServerSentEvent, TableRows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.control.controller import Controller
@@ -67,7 +67,7 @@ def runs_stream(
 ) -> Response:
     """The changes in a page of the list, as events."""
     actor = actor_of(request)
-    table, controller = Rows(), controller_of(request)
+    table, controller = TableRows(), controller_of(request)
     return stream(request, lambda: table.changes(_window(controller, actor, search, after), {}), _INTERVAL, stored=True)
 
 
@@ -96,16 +96,16 @@ def run(request: Request, name: str) -> Response:
 def run_stream(request: Request, name: str) -> Response:
     """The changes in the tables of a run, as events; ``changed`` when it has new metrics."""
     _ = run_routes.run_detail(request, name)  # refused at once, if at all
-    known = {key: Rows(key) for key in _TABLES}
+    known = {key: TableRows(key) for key in _TABLES}
     controller, before = controller_of(request), [-1]
 
-    def changes() -> Sequence[Event]:
+    def changes() -> Sequence[ServerSentEvent]:
         _, tables = _read_run(request, name)
         found = [event for key, rows in tables.items() for event in known[key].changes(rows, {})]
         metrics = last_metrics(controller.access.store.run(name)) or {}
         if (iteration := metrics.get("iteration", 0)) != before[0]:
             before[0] = iteration
-            found.append(Event("changed", {"iteration": iteration, **_progress(name, metrics)}))
+            found.append(ServerSentEvent("changed", {"iteration": iteration, **_progress(name, metrics)}))
         return found
 
     return stream(request, changes, stored=True)

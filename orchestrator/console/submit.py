@@ -19,8 +19,8 @@ from orchestrator.console.forms import TOKEN, Form, done, sent_form
 from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.console.submit_fields import Group, document, filled, form_of, forms, groups, tasks, written
-from orchestrator.console.submit_help import SOURCE, Problem, help_at, problem_of
+from orchestrator.console.submit_fields import FieldGroup, document, filled, form_of, forms, groups, tasks, written
+from orchestrator.console.submit_help import SOURCE, SubmissionProblem, help_at, problem_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services import permissions
 from orchestrator.services.context import queue_names
@@ -176,22 +176,22 @@ def _submitted(request: Request, form: Form) -> tuple[str, str]:
     return job.id, job.name
 
 
-def _unfit(request: Request, spec: Spec, body: PlanRequest) -> Problem | None:
+def _unfit(request: Request, spec: Spec, body: PlanRequest) -> SubmissionProblem | None:
     """Why the job could never start."""
     try:
         problem = plan_routes.fits(request, body)["problem"]
     except permissions.Refusal:
         raise
     except UnknownQueue as error:
-        return Problem(str(error), "queue")
+        return SubmissionProblem(str(error), "queue")
     except ClientError as error:
-        return Problem(str(error))
+        return SubmissionProblem(str(error))
     if problem and problem.startswith("evaluation: "):
-        return Problem(problem.removeprefix("evaluation: "), "evaluation")
-    return Problem(problem, "resources.cpus") if problem else None
+        return SubmissionProblem(problem.removeprefix("evaluation: "), "evaluation")
+    return SubmissionProblem(problem, "resources.cpus") if problem else None
 
 
-def _checked(request: Request, text: str, whole: bool) -> tuple[Spec | None, Problem | None]:
+def _checked(request: Request, text: str, whole: bool) -> tuple[Spec | None, SubmissionProblem | None]:
     """The spec of a text, or its problem.
 
     A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys its text is checked here, and
@@ -223,7 +223,7 @@ def _lines(text: str) -> str:
     return text.replace("\r\n", "\n")
 
 
-def _groups(request: Request, task: str) -> list[Group]:
+def _groups(request: Request, task: str) -> list[FieldGroup]:
     actor = actor_of(request)
     actor.check(Operation.SUBMIT_JOB)
     if task not in tasks():
@@ -233,7 +233,7 @@ def _groups(request: Request, task: str) -> list[Group]:
 
 
 def _wizard(
-    request: Request, task: str, found: Sequence[Group], problem: Problem | None, status: int = 200
+    request: Request, task: str, found: Sequence[FieldGroup], problem: SubmissionProblem | None, status: int = 200
 ) -> Response:
     actor = actor_of(request)
     text = written(document(task, found))
@@ -261,7 +261,7 @@ def _nearest_field(key: str, names: Sequence[str]) -> str:
     return max((name for name in names if f"{key}.".startswith(f"{name}.")), key=len, default="")
 
 
-def _editor(request: Request, text: str, problem: Problem | None, status: int = 200) -> Response:
+def _editor(request: Request, text: str, problem: SubmissionProblem | None, status: int = 200) -> Response:
     actor = actor_of(request)
     actor.check(Operation.SUBMIT_JOB)
     return render(request, "submit_yaml.html", status, text=text, problem=problem, help=help_at(text, 1))

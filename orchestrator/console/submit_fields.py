@@ -60,7 +60,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Group:
+class FieldGroup:
     """Fields under one heading."""
 
     title: str
@@ -79,7 +79,7 @@ class TaskForm:
     """Of these tasks, where one is chosen."""
     includes: Callable[[str], bool]
     """Whether a task is one of them."""
-    groups: Callable[[str], list[Group]]
+    groups: Callable[[str], list[FieldGroup]]
     """Further fields of a task, which stand before those of its schema."""
     keys: frozenset[str]
     """The keys of the task's configuration that they give."""
@@ -139,7 +139,7 @@ def _sentence(text: str) -> str:
     return line.partition(" Rewards: see")[0]
 
 
-def groups(task: str, queues: Sequence[str]) -> list[Group]:
+def groups(task: str, queues: Sequence[str]) -> list[FieldGroup]:
     """The wizard's fields for a task. ``queues``: those to which the caller may submit."""
     form = form_of(task)
     named = {"name": re.sub(r"[^A-Za-z0-9_-]", "-", task).strip("-").lower(), **_FIRST}
@@ -155,12 +155,12 @@ def groups(task: str, queues: Sequence[str]) -> list[Group]:
             for each in found
         )
 
-    found = [Group("Job", job(*_JOB), True), Group("Training", job(*_TRAINING), True)]
+    found = [FieldGroup("Job", job(*_JOB), True), FieldGroup("Training", job(*_TRAINING), True)]
     found += form.groups(task) if form else []
     config = config_schema(task)
     if config is None:
         hint = "This task publishes no schema; its ranks check the settings."
-        found.append(Group("Configuration of the task", (Field("train.config", hint="YAML"),), hint=hint))
+        found.append(FieldGroup("Configuration of the task", (Field("train.config", hint="YAML"),), hint=hint))
     else:
         left_out = {*kept_files(task_config(task)), *(form.keys if form else ())}
         found += _groups("Task", config["properties"], "train.config", left_out)
@@ -168,7 +168,7 @@ def groups(task: str, queues: Sequence[str]) -> list[Group]:
         section = job_schema()["$defs"][f"Settings_{name}"]
         hint = "Empty fields keep the task's own values."
         found += _groups(f"Algorithm {name}", section["properties"], f"train.{name}", (), name, hint)
-    return [*found, Group("More", job(*_MORE))]
+    return [*found, FieldGroup("More", job(*_MORE))]
 
 
 def _at(path: str) -> Mapping[str, Any]:
@@ -181,10 +181,10 @@ def _at(path: str) -> Mapping[str, Any]:
 
 def _groups(
     title: str, properties: Mapping[str, Any], prefix: str, without: Any, algorithm: str = "", hint: str = ""
-) -> Iterator[Group]:
+) -> Iterator[FieldGroup]:
     """A group of the plain fields of a section, then one for each section in it."""
     own: list[Field] = []
-    inner: list[Group] = []
+    inner: list[FieldGroup] = []
     for key, about in properties.items():
         if key in without:
             continue
@@ -193,7 +193,7 @@ def _groups(
         else:
             own.append(_field(f"{prefix}.{key}", about))
     if own:
-        yield Group(title, tuple(own), algorithm=algorithm, hint=hint)
+        yield FieldGroup(title, tuple(own), algorithm=algorithm, hint=hint)
     yield from inner
 
 
@@ -224,7 +224,7 @@ def bounds(about: Mapping[str, Any]) -> str:
     return " ".join(filter(None, (words.get(str(about.get("type")), ""), *told)))
 
 
-def filled(form: Form, found: Sequence[Group]) -> list[Group]:
+def filled(form: Form, found: Sequence[FieldGroup]) -> list[FieldGroup]:
     """The groups with the values of a form that was sent."""
     return [
         replace(
@@ -242,7 +242,7 @@ def _given(form: Form, field: Field) -> str:
     return form.one(field.name).replace("\r\n", "\n")
 
 
-def document(task: str, found: Sequence[Group]) -> dict[str, Any]:
+def document(task: str, found: Sequence[FieldGroup]) -> dict[str, Any]:
     """The job described by filled groups."""
     result: dict[str, Any] = {}
     algorithm = next((each.value for group in found for each in group.fields if each.name == "train.algorithm"), "")

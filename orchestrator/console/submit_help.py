@@ -16,7 +16,7 @@ _PLACE = re.compile(rf"{re.escape(SOURCE)}(?::(\d+))?: (?:([\w.-]+): )?(.*)", re
 
 
 @dataclass(frozen=True)
-class Problem:
+class SubmissionProblem:
     """Why a job can't be submitted."""
 
     message: str
@@ -31,15 +31,15 @@ class Problem:
         return asdict(self)
 
 
-def problem_of(error: str, text: str) -> Problem:
+def problem_of(error: str, text: str) -> SubmissionProblem:
     """An error of a spec that was read from ``text`` under the name :data:`SOURCE`."""
     found = _PLACE.fullmatch(error)
     if found is None:
-        return Problem(error)
+        return SubmissionProblem(error)
     line, key, message = int(found[1] or 0), found[2] or "", found[3]
     inside = re.match(r"[^\s:]+:(\d+): [A-Z_]+: ", message)
     code_line = int(inside[1]) if inside and key.startswith("train.config.") else 0
-    return Problem(message, key, _line_of_code(text, key, code_line) or line, code_line)
+    return SubmissionProblem(message, key, _line_of_code(text, key, code_line) or line, code_line)
 
 
 def _line_of_code(text: str, key: str, code_line: int) -> int:

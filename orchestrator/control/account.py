@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import UsageError
 from orchestrator.engines.installed import ENGINES
-from orchestrator.persistence.models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
+from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 from orchestrator.persistence.own_models import KnownAccount, LogGroup
 
 

@@ -20,10 +20,10 @@ from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import Reason, named
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.scheduling.decisions import Cancel, Decisions, Preempt, Start, decide
 from orchestrator.scheduling.reasons import WaitReport
-from orchestrator.scheduling.snapshot import Leading, Turns
+from orchestrator.scheduling.snapshot import Leading, RoundRobin
 
 _PASS_INTERVAL, _LONGEST_PASS_INTERVAL = 1.0, 16.0
 """Seconds between passes while nothing changes, at first and at most: shares decay and limits run out by themselves."""
@@ -53,7 +53,7 @@ class Admission:
         self._short = False
         self._report: WaitReport | None = None
         self._leading: Mapping[str, Leading] = {}
-        self._turns = Turns()
+        self._turns = RoundRobin()
         self._passed: tuple[int, float, float] = (-1, 0.0, 0.0)
         """Of the last pass: the version of the work queue, when it began, and the seconds that it took."""
         self._pass_interval = _PASS_INTERVAL

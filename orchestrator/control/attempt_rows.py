@@ -11,9 +11,9 @@ from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import options_of
-from orchestrator.domain.attempt import State, Terms
+from orchestrator.domain.attempt import AttemptState, Terms
 from orchestrator.domain.job import Ending, Status, Verdict
-from orchestrator.persistence.models import (
+from orchestrator.persistence.batch_models import (
     Attempt,
     ComputeEnvironment,
     Job,
@@ -30,7 +30,7 @@ NO_EPOCH = 0
 """Of an attempt that has none yet."""
 
 
-def state_of(job: Job, attempt: Attempt) -> State:
+def state_of(job: Job, attempt: Attempt) -> AttemptState:
     """The state of an attempt, by its rows: all but what only a controller's memory has."""
     gang = job.gang
     spent = [each for each in job.attempts if each.spent and each is not attempt]
@@ -54,7 +54,7 @@ def state_of(job: Job, attempt: Attempt) -> State:
         main = attempt.node(gang.main)
         error = main.reason if main is not None and attempt.handle is None else None
         verdict = Verdict(ending, reason, attempt.exit_code, fault=attempt.fault, start_error=error)
-    return State(
+    return AttemptState(
         terms,
         prepared=attempt.epoch != NO_EPOCH,
         launched=attempt.handle is not None,

@@ -22,11 +22,11 @@ from orchestrator.control.clock import Clock
 from orchestrator.control.kept_texts import KeptTexts, references_of
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.observer import CHECK_INTERVAL, Observer
-from orchestrator.control.run_store import Errands, Key, Progress, RunFacts, RunRefused, RunStore, StoreUnavailable
+from orchestrator.control.run_store import Errands, Key, ObservedRun, RunContent, RunRefused, RunStore, StoreUnavailable
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
-from orchestrator.domain.attempt import FINISHING, Phase, State, after, step
+from orchestrator.domain.attempt import FINISHING, AttemptPhase, AttemptState, after, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -60,8 +60,8 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status
 from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
+from orchestrator.persistence.batch_models import Attempt, Job, now
 from orchestrator.persistence.log_groups import record_logs
-from orchestrator.persistence.models import Attempt, Job, now
 from orchestrator.persistence.ownership import first_description, record_owner
 from orchestrator.scheduling.decisions import Start
 from shared_store.volume.epoch import Claim
@@ -86,14 +86,14 @@ class _Open:
     """What is known of an open attempt beside its rows."""
 
     key: Key
-    state: State
+    state: AttemptState
     is_current: bool = True
     """Whether the state is that of the rows: they were not read anew since."""
-    run: RunFacts | None = None
+    run: ObservedRun | None = None
     """The run, as it was found before the attempt takes it."""
     taking: Callable[[], int] | None = None
     """Takes the run; returns the epoch."""
-    progress: Progress | None = None
+    progress: RunContent | None = None
     """What the run holds once the gang is stopped."""
     uncommitted: list[Callable[[], None]] = field(default_factory=list)
     """What the metrics are to note after the next commit."""
@@ -165,7 +165,7 @@ class Attempts:
             return _LATER
         opened = self._opened(job, attempt)
         key, state = opened.key, opened.state
-        if state.phase is Phase.LAUNCHING:
+        if state.phase is AttemptPhase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
         elif self._stops.has_begun(key):
             pause = self._stops.pause(key)
@@ -201,7 +201,7 @@ class Attempts:
                     if then is not None:
                         yield from self._happened(session, job, attempt, opened, then)
 
-    def share(self, session: Session, jobs: Sequence[Job]) -> None:
+    def load_shared_rows(self, session: Session, jobs: Sequence[Job]) -> None:
         """These jobs are worked on next: what their attempts share is read once."""
         self._rows = SharedRows(session, jobs)
 
@@ -274,7 +274,7 @@ class Attempts:
             return PrepareRefused(str(error))
         return Prepared(epoch) if epoch is not None else self._errands.delayed(key)
 
-    def _take(self, session: Session, job: Job, attempt: Attempt, run: RunFacts) -> Callable[[], int]:
+    def _take(self, session: Session, job: Job, attempt: Attempt, run: ObservedRun) -> Callable[[], int]:
         """The call that takes the run, whose owner is recorded here. Raises RunRefused."""
         # The database and the store each remember; whichever is ahead (a restored database, a moved store) counts.
         known = self._rows.epochs(job.run)

@@ -14,7 +14,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.installed import ENGINES
-from orchestrator.persistence.models import ComputeEnvironment, Job, JobQueue
+from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobQueue
 from shared_store.contract.error_text import counted
 
 log = logging.getLogger("muster.controller")

@@ -25,7 +25,7 @@ from orchestrator import machine
 from orchestrator.control.controller import Controller
 from orchestrator.control.webhooks import PAUSES, Webhook, event_of, kind_of, run_of
 from orchestrator.engines.toolkit.backoff import Backoff
-from orchestrator.persistence.models import Job, JobQueue, now
+from orchestrator.persistence.batch_models import Job, JobQueue, now
 from orchestrator.persistence.own_models import WebhookDelivery
 from orchestrator.persistence.ownership import is_of_earlier_run
 from orchestrator.persistence.session import DatabaseError

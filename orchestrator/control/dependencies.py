@@ -9,7 +9,7 @@ from orchestrator.control.clock import Clock
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.job import WAITING, Status
 from orchestrator.domain.reasons import array_of, named
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 
 _NAMED = 3
 """Greatest number of failed children that an array's reason names."""

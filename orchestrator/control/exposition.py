@@ -21,7 +21,7 @@ from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.store_calls import THREADS
 from orchestrator.control.usage import held_by
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import JobQueue
+from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.persistence.session import DatabaseError
 from shared_store import __version__
 

@@ -14,8 +14,8 @@ from orchestrator.control.loaded import LoadedJobs
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.toolkit.backoff import Backoff
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.columns import storable
-from orchestrator.persistence.models import Job
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
 
 _AT_ONCE = 1000

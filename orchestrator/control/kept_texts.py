@@ -22,9 +22,9 @@ from orchestrator import machine
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL
-from orchestrator.persistence.models import Job, JobDefinition, now
+from orchestrator.persistence.batch_models import Job, JobDefinition, now
 from orchestrator.persistence.own_models import KeptText
-from orchestrator.persistence.references import is_of_submission
+from orchestrator.persistence.retention_rows import is_of_submission
 from orchestrator.persistence.session import Database, DatabaseError
 from shared_store.volume import texts
 from shared_store.volume.layout import Store

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from orchestrator import machine
 from shared_store.volume.layout import Run
-from shared_store.volume.log_files import UNKNOWN, Chunk, Identity, Segment, read_log
+from shared_store.volume.log_files import UNKNOWN, Chunk, Identity, LogSegment, read_log
 from shared_store.volume.log_view import Key, log_end, logs_of
 
 MOST = 256 << 10
@@ -96,7 +96,7 @@ class Tail:
             self.stated = None if self.stated is None else max(self.stated, self.end)
         return self.end > before
 
-    def missing(self, segments: Sequence[Segment]) -> Found:
+    def missing(self, segments: Sequence[LogSegment]) -> Found:
         """What the file has after the end; nothing where that is not visible here yet. Raises OSError."""
         is_ahead = self.fed and (self.stated is None or self.stated >= self.end)
         chunk = read_log(segments, self.end, _READ, self.identity, self.inside, is_ahead)
@@ -253,7 +253,7 @@ class JobLogs:
             self._has_looked = True
         return changed
 
-    def _look_at(self, log: Key, segments: Sequence[Segment], is_first: bool, is_last: bool) -> bool:
+    def _look_at(self, log: Key, segments: Sequence[LogSegment], is_first: bool, is_last: bool) -> bool:
         with self._lock:
             tail = self._tails.setdefault(log, Tail(0))
             if not (is_first or is_last) and tail.delivers(machine.monotonic()) and not tail.has_gap:

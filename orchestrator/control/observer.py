@@ -10,14 +10,14 @@ from functools import partial
 from orchestrator import machine
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
-from orchestrator.control.endings import node_end
-from orchestrator.control.run_store import Errands, Key, Progress, RunStore
+from orchestrator.control.node_ends import node_end
+from orchestrator.control.run_store import Errands, Key, RunContent, RunStore
 from orchestrator.domain.attempt_events import Observed, Silence
 from orchestrator.domain.job import NodeEnd, aws_ending
 from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.models import Attempt, Job, Node, now
-from shared_store.volume.outcomes import Outcome
+from orchestrator.persistence.batch_models import Attempt, Job, Node, now
+from shared_store.volume.node_outcomes import Outcome
 
 CHECK_INTERVAL = 5.0
 """Seconds between two looks at a gang of which a node can't be seen or heard, or whose cause is not known yet."""
@@ -31,7 +31,7 @@ class _Seen:
     """Of nodes that have ended, by index; None for one that has left none."""
     checked: float | None = None
     """When they were read last (monotonic [s])."""
-    progress: Progress | None = None
+    progress: RunContent | None = None
     """What the run holds, read after the last of them was found."""
     has_hidden: bool = False
     """Whether a node could not be seen or heard at the last look."""
@@ -126,12 +126,12 @@ class Observer:
 
     def _read(
         self, run: str, epoch: int, key: Key, nodes: Sequence[int], missing: frozenset[int]
-    ) -> tuple[Mapping[int, Outcome], Progress | None]:
+    ) -> tuple[Mapping[int, Outcome], RunContent | None]:
         """The outcomes of these nodes; where none is ``missing`` any more, so that nothing writes into the run, what that holds, too."""
         found = self._runs.outcomes(run, *key, nodes)
         return found, self._runs.progress(run, epoch) if missing <= found.keys() else None
 
-    def progress(self, key: Key) -> Progress | None:
+    def progress(self, key: Key) -> RunContent | None:
         """What the run held after all nodes of an attempt had left their outcomes; None where that was not read."""
         return self._seen[key].progress if key in self._seen else None
 

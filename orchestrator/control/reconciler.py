@@ -28,7 +28,7 @@ from orchestrator.control.upkeep import INTERVAL, Upkeep
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.control.writes import Writes
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.batch_models import Attempt, Job
 from orchestrator.persistence.session import Database
 
 _SETTLED_A_TICK = 1000
@@ -81,7 +81,7 @@ class Reconciler:
         self._thread: threading.Thread | None = None
         bus.changed = engines.changed = alarm.gang_changed
         database.committed, database.changed = self._committed, self._look_again
-        isolation.before, loaded.reread = attempts.share, attempts.forget_states
+        isolation.before, loaded.reread = attempts.load_shared_rows, attempts.forget_states
         with database.session() as session:
             clock.restore(session)
             self._take_up(session)  # before the router is there for the nodes

@@ -23,15 +23,15 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.peers import Peers
-from orchestrator.control.retention_looks import CONTROLLER, Look, Place, Step, Totals, Whose
+from orchestrator.control.retention_looks import CONTROLLER, PassCursor, PassTotals, RetentionStep, Step, Whose
+from orchestrator.control.run_facts import StoredRuns
 from orchestrator.control.run_users import RunUsers
-from orchestrator.control.stored_runs import StoredRuns
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import JobFacts, References, Rules, RunFacts, decide, still_needed
-from orchestrator.persistence import references as rows
-from orchestrator.persistence.models import Job, JobQueue, RunRecord, now
+from orchestrator.domain.retention import JobFacts, References, RetentionRules, RunFacts, decide, still_needed
+from orchestrator.persistence import retention_rows as rows
+from orchestrator.persistence.batch_models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database
 from shared_store.contract.error_text import counted
@@ -88,7 +88,7 @@ class Retention:
             writing: Held while something is submitted.
             check: Raises Unavailable where the store is not there: what is missing may be missing for that.
             steady: Steady time [ms]; of two clocks, the one that is behind decides.
-            default: Seconds for which jobs of queues without a rule are kept; None: as :class:`Rules` says. Infinity: without end,
+            default: Seconds for which jobs of queues without a rule are kept; None: as :class:`RetentionRules` says. Infinity: without end,
                 and nothing goes by itself.
         """
         self._database, self._store, self._users = database, store, users
@@ -147,7 +147,7 @@ class Retention:
         else:
             self.take_all()
 
-    def take_all(self) -> Totals:
+    def take_all(self) -> PassTotals:
         """Take everything that may go, step by step. Raises Unavailable, OSError."""
         self._fixed.clear()
         totals = self._all(lambda rules, place: self.step(place, rules, take=True))
@@ -177,9 +177,9 @@ class Retention:
             totals,
         )
 
-    def _all(self, step: Callable[[Rules, Place], Step]) -> Totals:
+    def _all(self, step: Callable[[RetentionRules, PassCursor], Step]) -> PassTotals:
         """Step by step with the rules of each moment, and a rest after each."""
-        totals, place = Totals(), Place()
+        totals, place = PassTotals(), PassCursor()
         while not self._is_closing.is_set():
             began = machine.processor_time()
             looks, following = step(self.rules(), place)
@@ -201,19 +201,19 @@ class Retention:
 
     # -- one step -------------------------------------------------------------------------------------------------------
 
-    def rules(self) -> Rules:
+    def rules(self) -> RetentionRules:
         """The rules as they are now."""
         with self._database.session() as session:
             start = session.get(RetentionStart, 1)
             tags = {queue.name: queue.tags.get(retention.TAG) for queue in session.scalars(select(JobQueue))}
         queues = {name: _age_of(tag) for name, tag in tags.items() if tag is not None}
         others = [name for name, tag in tags.items() if tag is None]
-        return Rules(queues, others, self._default, start.since if start else 0, batch=self._is_on)
+        return RetentionRules(queues, others, self._default, start.since if start else 0, batch=self._is_on)
 
     def step(
         self,
-        after: Place,
-        rules: Rules,
+        after: PassCursor,
+        rules: RetentionRules,
         *,
         take: bool,
         whose: Whose = CONTROLLER,
@@ -264,14 +264,14 @@ class Retention:
                 for run in taken:
                     self._users.let_go(run)
         shown = [each for each in described.values() if each["jobs"] or each["kept"]]
-        return shown, Place(found[-1].stopped_at, found[-1].id) if len(found) == most else None
+        return shown, PassCursor(found[-1].stopped_at, found[-1].id) if len(found) == most else None
 
     def _take(self, runs: Sequence[str]) -> list[str]:
         """Those of the runs that nobody uses; from now on nobody does."""
         with self._writing:
             return [run for run in runs if run not in self._beginning and self._users.take(run)]
 
-    def _looks(self, runs: Collection[str], rules: Rules, moment: int, whose: Whose) -> list[Look]:
+    def _looks(self, runs: Collection[str], rules: RetentionRules, moment: int, whose: Whose) -> list[RetentionStep]:
         """What may go of these runs and their jobs. Raises Unavailable, OSError."""
         if not runs:
             return []
@@ -284,7 +284,7 @@ class Retention:
         return [self._look(run, facts[run], jobs[run], needed) for run in sorted(runs)]
 
     def _jobs(
-        self, session: Session, runs: Collection[str], rules: Rules, moment: int, whose: Whose
+        self, session: Session, runs: Collection[str], rules: RetentionRules, moment: int, whose: Whose
     ) -> dict[str, list[JobFacts]]:
         """The jobs of the runs; those of others, and all of a run that is another's, never go."""
         jobs = rows.jobs_of_runs(session, runs, rules, moment)
@@ -299,20 +299,20 @@ class Retention:
             for run, of_run in jobs.items()
         }
 
-    def _look(self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References) -> Look:
+    def _look(self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References) -> RetentionStep:
         decision, run = decide(facts, jobs, needed), self._store.run(name)
         if decision.run:
-            return Look(name, decision, facts, (run.path,))
-        return Look(
+            return RetentionStep(name, decision, facts, (run.path,))
+        return RetentionStep(
             name, decision, facts, tuple(path for job in decision.jobs for path in contents.job_directories(run, job))
         )
 
-    def _carry_out(self, looks: Sequence[Look]) -> tuple[Collection[str], Mapping[str, str]]:
+    def _carry_out(self, looks: Sequence[RetentionStep]) -> tuple[Collection[str], Mapping[str, str]]:
         """Move into the trash what goes, delete the rows, and empty the trash.
 
         Returns the jobs that went, and why something of a run stays, by run. Raises Unavailable, OSError.
         """
-        unchanged, stay, gone = list[Look](), dict[str, str](), set[str]()
+        unchanged, stay, gone = list[RetentionStep](), dict[str, str](), set[str]()
         self.stored.check()
         thrown, fixed = trash.throw_away(self._store, self._directories(looks, unchanged, stay))
         self.stored.check()
@@ -336,7 +336,9 @@ class Retention:
         self._remove(thrown)
         return gone, stay
 
-    def _directories(self, looks: Sequence[Look], unchanged: list[Look], stay: dict[str, str]) -> Iterator[Path]:
+    def _directories(
+        self, looks: Sequence[RetentionStep], unchanged: list[RetentionStep], stay: dict[str, str]
+    ) -> Iterator[Path]:
         """The directories that go. Each run is read again right before: since it was looked at, another controller may have begun an
         attempt of it, which no lock of this one keeps out.
         """

@@ -28,7 +28,7 @@ CONTROLLER = Whose("this controller")
 
 
 @dataclass(frozen=True)
-class Look:
+class RetentionStep:
     """What a step does, or would do, with a run and its jobs."""
 
     run: str
@@ -52,7 +52,7 @@ class Look:
 
 
 @dataclass
-class Totals:
+class PassTotals:
     """What a pass has taken."""
 
     jobs: int = 0
@@ -71,7 +71,7 @@ class Totals:
 
 
 @dataclass(frozen=True)
-class Place:
+class PassCursor:
     """Where a pass is: everything that ended before was looked at."""
 
     stopped_at: int = -1
@@ -81,7 +81,7 @@ class Place:
         return f"{self.stopped_at}.{self.job}"
 
     @classmethod
-    def of(cls, text: str) -> Place:
+    def of(cls, text: str) -> PassCursor:
         """Raises ValueError."""
         moment, dot, job = text.partition(".")
         if not dot or not moment.isdecimal() or len(moment) > 16:
@@ -89,5 +89,5 @@ class Place:
         return cls(int(moment), job)
 
 
-Step = tuple[list[dict[str, Any]], Place | None]
-"""What a step has found, as :meth:`Look.described`, and where the next one begins."""
+Step = tuple[list[dict[str, Any]], PassCursor | None]
+"""What a step has found, as :meth:`RetentionStep.described`, and where the next one begins."""

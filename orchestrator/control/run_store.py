@@ -25,7 +25,7 @@ from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.volume.epoch import Claim, StaleEpoch, close_claim, read_epoch, take_epoch
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run, Store, StoreError
-from shared_store.volume.outcomes import Outcome, read_outcome
+from shared_store.volume.node_outcomes import Outcome, read_outcome
 from shared_store.volume.texts import Reference, keep, read_either
 
 log = logging.getLogger("muster.controller")
@@ -46,7 +46,7 @@ class RunRefused(Exception):
 
 
 @dataclass(frozen=True)
-class RunFacts:
+class ObservedRun:
     """A run as it was found; a :class:`shared_store.volume.layout.Run` for those who only read its ``run.json``."""
 
     name: str
@@ -68,17 +68,17 @@ class RunFacts:
         return self.content
 
 
-def facts_of(run: Run) -> RunFacts:
+def facts_of(run: Run) -> ObservedRun:
     """A run as the store has it now. Raises OSError."""
     try:
         content, damage = run.description(), ""
     except (ValueError, RecursionError) as error:
         content, damage = None, str(error)
-    return RunFacts(run.name, run.is_missing(), content, damage)
+    return ObservedRun(run.name, run.is_missing(), content, damage)
 
 
 @dataclass(frozen=True)
-class Progress:
+class RunContent:
     """What a run holds after an attempt."""
 
     iteration: int | None = None
@@ -94,10 +94,10 @@ class RunStore:
         """``check``: raises OSError where the volume of the store is not there, or another one is."""
         self.store, self.peers, self._check = store, peers, check
 
-    def examine(self, name: str) -> RunFacts:
+    def examine(self, name: str) -> ObservedRun:
         """A run before an attempt begins. Raises RunRefused."""
 
-        def body() -> RunFacts:
+        def body() -> ObservedRun:
             run = self.store.run(name)
             return replace(facts_of(run), epoch=read_epoch(run), writer=self.peers.writer(run))
 
@@ -135,17 +135,17 @@ class RunStore:
 
         return self._call("read outcomes", body)
 
-    def progress(self, name: str, epoch: int) -> Progress:
+    def progress(self, name: str, epoch: int) -> RunContent:
         """What the run holds after the attempt of this epoch."""
 
-        def body() -> Progress:
+        def body() -> RunContent:
             checkpoints = list_checkpoints(self.store.run(name))
             iteration = checkpoints[-1].iteration if checkpoints else None
             for checkpoint in reversed(checkpoints):
                 if checkpoint.epoch == epoch:
                     with suppress(DamagedCheckpoint, KeyError, TypeError, ValueError):
-                        return Progress(iteration, float(checkpoint.manifest["created"]))
-            return Progress(iteration)
+                        return RunContent(iteration, float(checkpoint.manifest["created"]))
+            return RunContent(iteration)
 
         return self._call(f"read the checkpoints of run {name}", body)
 

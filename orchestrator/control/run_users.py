@@ -1,7 +1,7 @@
 """The users of a run: requests that read it, or the one that deletes it. Of these, the first keeps out the others.
 
 A request that continues, clones, registers or cites a run uses it from its first look at the store until its answer. A job that was
-submitted needs no entry: its row is what keeps its runs (:mod:`orchestrator.persistence.references`).
+submitted needs no entry: its row is what keeps its runs (:mod:`orchestrator.persistence.retention_rows`).
 """
 
 from __future__ import annotations

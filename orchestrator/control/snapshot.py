@@ -15,18 +15,18 @@ from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Capacity, Host, Placement, Queued, engine_of
 from orchestrator.domain.native_options import NativeOptions
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence import models
-from orchestrator.persistence.models import Attempt, Job, JobQueue, Node, SchedulingPolicy
+from orchestrator.persistence import batch_models
+from orchestrator.persistence.batch_models import Attempt, Job, JobQueue, Node, SchedulingPolicy
 from orchestrator.scheduling.fit import Fit, fit
 from orchestrator.scheduling.snapshot import (
     ComputeEnvironment,
     FairShare,
     Leading,
     Queue,
-    Running,
+    RoundRobin,
+    RunningGang,
     Snapshot,
     TimeLimit,
-    Turns,
     Waiting,
 )
 
@@ -44,7 +44,7 @@ def take_snapshot(
     waiting: Sequence[Waiting],
     holding: Sequence[tuple[Job, Attempt]],
     leading: Mapping[str, Leading],
-    turns: Turns,
+    turns: RoundRobin,
     first: str = "local",
     unknown: Mapping[str, str] | None = None,
 ) -> Snapshot:
@@ -69,7 +69,7 @@ def take_snapshot(
     }
     ces = {
         each.name: read_compute_environment(each, first, unknown)
-        for each in session.scalars(select(models.ComputeEnvironment), execution_options=anew)
+        for each in session.scalars(select(batch_models.ComputeEnvironment), execution_options=anew)
     }
     # what runs on an engine that queues by itself takes nothing away from what is handed to it
     queueing = {name for name, capacity in capacities.items() if isinstance(capacity, Queued)}
@@ -142,7 +142,7 @@ def _fair_share(document: Mapping[str, Any]) -> FairShare:
 
 
 def read_compute_environment(
-    row: models.ComputeEnvironment, first: str, unknown: Mapping[str, str] | None = None
+    row: batch_models.ComputeEnvironment, first: str, unknown: Mapping[str, str] | None = None
 ) -> ComputeEnvironment:
     """``first``: the engine of one that names none. ``unknown``: why an engine has not told what it has, by the names of those."""
     named = row.tags.get(HOSTS_TAG)
@@ -161,12 +161,12 @@ def new_nodes(placements: Sequence[Placement]) -> list[Node]:
     ]
 
 
-def _running(job: Job, attempt: Attempt) -> Running:
+def _running(job: Job, attempt: Attempt) -> RunningGang:
     try:
         options = job.gang.options
     except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
         options = NativeOptions()
-    return Running(
+    return RunningGang(
         job=job.id,
         name=job.name,
         queue=job.queue,

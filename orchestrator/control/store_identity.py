@@ -9,7 +9,7 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import Unavailable
-from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.batch_models import Attempt, Job
 from orchestrator.persistence.own_models import KnownStore
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Store, StoreError

@@ -12,7 +12,7 @@ from orchestrator.control.retention import Retention
 from orchestrator.control.store_access import StoreAccess
 from orchestrator.control.writes import Writes
 from orchestrator.domain.job import TERMINAL
-from orchestrator.persistence.models import Job, JobQueue
+from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
 

@@ -11,7 +11,7 @@ from sqlalchemy.orm import Session
 from orchestrator.domain.hosts import Placement
 from orchestrator.domain.job import Ending
 from orchestrator.domain.resources import Resources
-from orchestrator.persistence.models import Attempt, Job
+from orchestrator.persistence.batch_models import Attempt, Job
 from orchestrator.persistence.own_models import ShareUsage
 from orchestrator.scheduling.order import decayed
 

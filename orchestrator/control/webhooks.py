@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.own_secrets import WEBHOOKS, OwnSecrets
 from orchestrator.spec.model import KINDS
 from shared_store.contract.error_text import explain, path_of

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.job import TERMINAL, Status
-from orchestrator.persistence.models import Dependency, Job
+from orchestrator.persistence.batch_models import Dependency, Job
 from orchestrator.scheduling.snapshot import Waiting
 
 _LOADED_AT_ONCE = 1000

@@ -79,7 +79,7 @@ _DONE = "done before it was {}"
 _REPEATED = "{} ended the attempt before, too: not tried again after {} of {} attempts; correct it before you resume or submit again"
 
 
-class Phase(StrEnum):
+class AttemptPhase(StrEnum):
     """How far an attempt is."""
 
     PREPARING = "preparing"
@@ -130,7 +130,7 @@ class Terms:
 
 
 @dataclass(frozen=True)
-class State:
+class AttemptState:
     """An attempt as it is known. Times are steady time [ms]."""
 
     terms: Terms
@@ -152,54 +152,54 @@ class State:
     closed: bool = False
 
     @property
-    def phase(self) -> Phase:
+    def phase(self) -> AttemptPhase:
         if self.closed:
-            return Phase.CLOSED
+            return AttemptPhase.CLOSED
         if not self.prepared:
-            return Phase.PREPARING
+            return AttemptPhase.PREPARING
         if not self.launched:
-            return Phase.LAUNCHING
+            return AttemptPhase.LAUNCHING
         if self.verdict is not None:
-            return Phase.ENDING
-        return Phase.RUNNING if self.started else Phase.STARTING
+            return AttemptPhase.ENDING
+        return AttemptPhase.RUNNING if self.started else AttemptPhase.STARTING
 
 
-def step(state: State, event: Event) -> Instructions:
+def step(state: AttemptState, event: Event) -> Instructions:
     """What is to be done, in this order. An event that means nothing in a state is passed over."""
     match state.phase, event:
-        case Phase.CLOSED, _:
+        case AttemptPhase.CLOSED, _:
             return ()
-        case Phase.PREPARING, Due() if state.verdict is not None:
+        case AttemptPhase.PREPARING, Due() if state.verdict is not None:
             return (WindUp(),)
-        case Phase.PREPARING, Due() if state.stop_reason is not None:
+        case AttemptPhase.PREPARING, Due() if state.stop_reason is not None:
             return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
-        case Phase.PREPARING, Due():
+        case AttemptPhase.PREPARING, Due():
             return (Prepare(),)
-        case Phase.PREPARING, Prepared(epoch):
+        case AttemptPhase.PREPARING, Prepared(epoch):
             return TakeEpoch(epoch), Save(), Launch()
-        case Phase.PREPARING, PrepareDelayed(reason):
+        case AttemptPhase.PREPARING, PrepareDelayed(reason):
             return (Withdraw(reason),)
-        case Phase.PREPARING, PrepareRefused(reason):
+        case AttemptPhase.PREPARING, PrepareRefused(reason):
             return Decide(Verdict(Ending.FATAL, reason, start_error=reason)), WindUp()
-        case Phase.LAUNCHING, Due():
+        case AttemptPhase.LAUNCHING, Due():
             return (Launch(again=state.verdict is None and state.stop_reason is None),)
-        case Phase.LAUNCHING, Launched(handle):
+        case AttemptPhase.LAUNCHING, Launched(handle):
             return Keep(handle), Save(), Observe()
-        case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.verdict is not None:
+        case AttemptPhase.LAUNCHING, LaunchDelayed(unknown=False) if state.verdict is not None:
             return (WindUp(),)
-        case Phase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
+        case AttemptPhase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
             return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
-        case Phase.LAUNCHING, LaunchDelayed(reason) if reason:
+        case AttemptPhase.LAUNCHING, LaunchDelayed(reason) if reason:
             return (Explain(reason),)
-        case Phase.LAUNCHING, LaunchRefused() if state.verdict is not None:
+        case AttemptPhase.LAUNCHING, LaunchRefused() if state.verdict is not None:
             return (WindUp(),)
-        case Phase.LAUNCHING, LaunchRefused():
+        case AttemptPhase.LAUNCHING, LaunchRefused():
             return Decide(_refused(state.terms, event)), WindUp()
         case _, Preempted(reason) if state.verdict is None:
             return (Decide(Verdict(Ending.PREEMPTED, reason)),)
-        case Phase.STARTING | Phase.RUNNING | Phase.ENDING, Due():
+        case AttemptPhase.STARTING | AttemptPhase.RUNNING | AttemptPhase.ENDING, Due():
             return (Observe(),)
-        case Phase.STARTING | Phase.RUNNING | Phase.ENDING, Observed():
+        case AttemptPhase.STARTING | AttemptPhase.RUNNING | AttemptPhase.ENDING, Observed():
             return _observed(state, event)
         case _, Delayed(reason):
             return (Explain(reason),)
@@ -214,7 +214,7 @@ def _refused(terms: Terms, event: LaunchRefused) -> Verdict:
     return Verdict(ending, reason if terms.options.is_native else AWS_NOT_STARTED, start_error=event.reason)
 
 
-def _observed(state: State, seen: Observed) -> Instructions:
+def _observed(state: AttemptState, seen: Observed) -> Instructions:
     """The tables for a look, one after the other, each from the state that the one before leaves."""
     was_decided, done = state.verdict is not None, Instructions()
     for table in (_tell, _judge):
@@ -223,7 +223,7 @@ def _observed(state: State, seen: Observed) -> Instructions:
     return *done, *_end(state, seen, is_explained=was_decided and not done)
 
 
-def _tell(state: State, seen: Observed) -> Instructions:
+def _tell(state: AttemptState, seen: Observed) -> Instructions:
     """The reason that the job's user sees."""
     unheard = _unheard(state.terms, seen)
     if seen.unread is not None:
@@ -238,7 +238,7 @@ def _tell(state: State, seen: Observed) -> Instructions:
     return (Explain(runs),) if state.verdict is None else ()
 
 
-def _judge(state: State, seen: Observed) -> Instructions:
+def _judge(state: AttemptState, seen: Observed) -> Instructions:
     """Whether the attempt is to end, and how: by the nodes' ends once they are known, on request, for its silence, or for its time."""
     if state.verdict is not None:
         return ()
@@ -254,7 +254,7 @@ def _judge(state: State, seen: Observed) -> Instructions:
     return waits if verdict is None else (*waits, Decide(verdict))
 
 
-def _end(state: State, seen: Observed, *, is_explained: bool) -> Instructions:
+def _end(state: AttemptState, seen: Observed, *, is_explained: bool) -> Instructions:
     """Once the end is decided: the gang is stopped, unless its children may end by themselves.
 
     ``is_explained``: an earlier look has said why the job ends; the stop may have something to add, which stays.
@@ -304,14 +304,14 @@ def _unheard(terms: Terms, seen: Observed) -> str:
     return ""
 
 
-def _by_time(state: State, moment: int) -> Verdict | None:
+def _by_time(state: AttemptState, moment: int) -> Verdict | None:
     timeout, since = state.terms.timeout, state.running_since
     if timeout and since and moment - since > timeout * 1000:
         return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
     return None
 
 
-def _close(state: State, verdict: Verdict, gone: Gone) -> Close:
+def _close(state: AttemptState, verdict: Verdict, gone: Gone) -> Close:
     """What becomes of the job: over, or RUNNABLE again."""
     terms, ending, progress = state.terms, verdict.ending, gone.progress
     native, number = terms.options.is_native, terms.number
@@ -384,7 +384,7 @@ def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:
     return retries(terms.conditions, verdict.exit_code, reason, verdict.reason)
 
 
-def after(state: State, instruction: Instruction) -> State:
+def after(state: AttemptState, instruction: Instruction) -> AttemptState:
     """The state once an instruction was carried out."""
     match instruction:
         case TakeEpoch():

@@ -149,7 +149,7 @@ def target_nodes(text: str, count: int) -> range:
 def gang_needs(node_properties: Mapping[str, Any]) -> GangSpec:
     """Read ``nodeProperties`` (overrides applied already); of nested ranges the later, inner one counts. Raises ValueError.
 
-    Of a job that is stored, :attr:`orchestrator.persistence.models.Job.gang` has what this read.
+    Of a job that is stored, :attr:`orchestrator.persistence.batch_models.Job.gang` has what this read.
     """
     if not node_properties:
         raise ValueError("nodeProperties are empty: the job's row in the database is damaged")

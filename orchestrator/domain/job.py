@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from shared_store.volume.outcomes import EX_TEMPFAIL, first_cause
+from shared_store.volume.node_outcomes import EX_TEMPFAIL, first_cause
 
 WAITING = "waiting for the scheduler"
 """Reason of a RUNNABLE job that no scheduling pass has considered yet."""

@@ -1,7 +1,7 @@
 """The retention of old jobs and runs: what may go, what is still needed, and why. Pure decisions over facts.
 
 :func:`still_needed` is the one place that knows for what a run is kept. A new kind of thing that needs runs adds
-:class:`Reference` values where they are collected (:mod:`shared_store.volume.references`, :mod:`orchestrator.persistence.references`);
+:class:`RetentionReference` values where they are collected (:mod:`shared_store.volume.references`, :mod:`orchestrator.persistence.retention_rows`);
 nothing changes here.
 """
 
@@ -49,7 +49,7 @@ def rule_of(text: str) -> int | None:
 
 
 @dataclass(frozen=True)
-class Reference:
+class RetentionReference:
     """Something needs a run, or a job."""
 
     kind: Literal["run", "job"]
@@ -69,7 +69,7 @@ class References:
     """What could not be read, and may need any run that has results."""
 
     @classmethod
-    def of(cls, references: Iterable[Reference], unreadable: Iterable[str] = ()) -> References:
+    def of(cls, references: Iterable[RetentionReference], unreadable: Iterable[str] = ()) -> References:
         found: dict[tuple[str, str], list[str]] = {}
         for each in references:
             found.setdefault((each.kind, each.name), []).append(each.by)
@@ -133,7 +133,7 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Rules:
+class RetentionRules:
     """How long jobs are kept. Times are Unix milliseconds.
 
     Attributes:

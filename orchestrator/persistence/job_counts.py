@@ -11,10 +11,10 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session, attributes
 
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 
 
-class Place(Enum):
+class ArrayRole(Enum):
     """Where a job stands."""
 
     ALONE = "alone"
@@ -22,11 +22,11 @@ class Place(Enum):
     CHILD = "child"
 
     @classmethod
-    def of(cls, parent: str | None, kind: str | None) -> Place:
+    def of(cls, parent: str | None, kind: str | None) -> ArrayRole:
         return cls.CHILD if parent is not None else cls.ARRAY if kind == "array" else cls.ALONE
 
 
-Kind = tuple[str, str, Place]
+Kind = tuple[str, str, ArrayRole]
 """A queue, a state and a place."""
 
 
@@ -43,7 +43,7 @@ class JobCounts:
         found = session.execute(select(*kinds, func.count()).group_by(*kinds))
         counts = Counter[Kind]()
         for queue, status, is_top, is_array, count in found:
-            place = Place.CHILD if not is_top else Place.ARRAY if is_array else Place.ALONE
+            place = ArrayRole.CHILD if not is_top else ArrayRole.ARRAY if is_array else ArrayRole.ALONE
             counts[queue, str(status), place] += int(count)
         with self._lock:
             self._counts = counts
@@ -60,7 +60,7 @@ class JobCounts:
         """The jobs of these queues, or of all, in each state, an array as one; states of none are left out."""
         found = Counter[str]()
         for (queue, status, place), count in self._kinds():
-            if place is not Place.CHILD and (queues is None or queue in queues):
+            if place is not ArrayRole.CHILD and (queues is None or queue in queues):
                 found[status] += count
         return dict(found)
 
@@ -68,7 +68,7 @@ class JobCounts:
         """The jobs of each queue in each state, an array as its children."""
         found = Counter[tuple[str, str]]()
         for (queue, status, place), count in self._kinds():
-            if place is not Place.ARRAY:
+            if place is not ArrayRole.ARRAY:
                 found[queue, status] += count
         return dict(found)
 
@@ -82,18 +82,18 @@ def note_counts(session: Session, changed: Iterable[object]) -> None:
     changes = _changes(session)
     for each in session.new:
         if isinstance(each, Job):
-            changes[each.queue, str(each.status or Status.SUBMITTED), Place.of(each.parent, each.kind)] += 1
+            changes[each.queue, str(each.status or Status.SUBMITTED), ArrayRole.of(each.parent, each.kind)] += 1
     for each in changed:
         if isinstance(each, Job) and (before := _stored(each)) != each.status:
-            place = Place.of(each.parent, each.kind)
+            place = ArrayRole.of(each.parent, each.kind)
             changes[each.queue, before, place] -= 1
             changes[each.queue, str(each.status), place] += 1
     for each in session.deleted:
         if isinstance(each, Job):
-            changes[each.queue, _stored(each), Place.of(each.parent, each.kind)] -= 1
+            changes[each.queue, _stored(each), ArrayRole.of(each.parent, each.kind)] -= 1
 
 
-def note_rows(session: Session, queue: str, status: str, place: Place, change: int) -> None:
+def note_rows(session: Session, queue: str, status: str, place: ArrayRole, change: int) -> None:
     """The same for rows that a statement inserts, or deletes (``change`` < 0)."""
     _changes(session)[queue, str(status), place] += change
 

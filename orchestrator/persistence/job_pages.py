@@ -11,8 +11,8 @@ from sqlalchemy import ColumnElement, func, or_, select, union_all
 from sqlalchemy.orm import Session, defer, selectinload
 
 from orchestrator.domain.errors import RequestError
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.keyset import behind
-from orchestrator.persistence.models import Job
 
 _KEYS = (Job.created_at, Job.id)
 _MOST_PARTS = 100
@@ -45,7 +45,7 @@ class Cursor:
 
 
 @dataclass(frozen=True)
-class Page:
+class JobPage:
     """Jobs of the list, the newest first."""
 
     jobs: Sequence[Job]
@@ -64,7 +64,7 @@ def read_page(
     *,
     after: Cursor | None = None,
     before: Cursor | None = None,
-) -> Page:
+) -> JobPage:
     """A page, with the attempts of its jobs, without their requests.
 
     Args:
@@ -83,7 +83,7 @@ def read_page(
     query = query.order_by(*_order(Job, backwards)).limit(most + 1)
     parts = [select(query.where(*part).subquery()) for part in _parts(queues, statuses)]
     if not parts:
-        return Page([], is_first=True, is_last=True)
+        return JobPage([], is_first=True, is_last=True)
     found = union_all(*parts).subquery()
     ids = select(found.c.id).order_by(*_order(found.c, backwards)).limit(most + 1)
     # one statement: a job that changes its state meanwhile is neither found twice nor missed
@@ -91,8 +91,8 @@ def read_page(
     read = session.scalars(whole.options(selectinload(Job.attempts), defer(Job.request))).all()
     has_more, jobs = len(read) > most, read[:most]
     if backwards:
-        return Page(jobs[::-1], is_first=not has_more, is_last=False)
-    return Page(jobs, is_first=after is None, is_last=not has_more)
+        return JobPage(jobs[::-1], is_first=not has_more, is_last=False)
+    return JobPage(jobs, is_first=after is None, is_last=not has_more)
 
 
 def contains(session: Session, text: str) -> ColumnElement[bool]:

@@ -9,7 +9,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
-from orchestrator.persistence.models import Job, Node
+from orchestrator.persistence.batch_models import Job, Node
 from orchestrator.persistence.own_models import LogGroup
 
 MOST = 1000

@@ -1,6 +1,7 @@
 """The models of what a controller is and keeps: its clock, store, account, keys, secrets, texts, messages, log groups, uses of runs and queues.
 
-Jobs are in :mod:`.models`.
+Jobs are in :mod:`.batch_models`. SQLAlchemy writes the rows of one flush in the order of these modules' names, so jobs come first, which rows
+here refer to.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from sqlalchemy import ForeignKey, Index
 from sqlalchemy.orm import Mapped, mapped_column, validates
 
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
+from orchestrator.persistence.batch_models import Base, now
 from orchestrator.persistence.columns import storable
-from orchestrator.persistence.models import Base, now
 
 
 class ClockState(Base):

@@ -13,7 +13,7 @@ from sqlalchemy import ColumnElement, or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.job import TERMINAL
-from orchestrator.persistence.models import Job, RunRecord, now
+from orchestrator.persistence.batch_models import Job, RunRecord, now
 from shared_store import __version__
 
 

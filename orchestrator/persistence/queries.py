@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session, aliased
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, TERMINAL, Status
 from orchestrator.domain.reasons import named
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 
 _NAMED = 5
 """Jobs that a refusal names."""

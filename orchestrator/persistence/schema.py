@@ -6,12 +6,12 @@ from pathlib import Path
 
 from sqlalchemy import Column, Connection, MetaData, String, Table, insert, inspect, select
 
-from orchestrator.persistence.models import Base, ComputeEnvironment, JobQueue
+from orchestrator.persistence.batch_models import Base, ComputeEnvironment, JobQueue
 from orchestrator.persistence.own_models import KnownAccount  # noqa: F401 (its tables, too)
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 NEWEST = max(path.name for path in (MIGRATIONS / "versions").glob("[0-9]*.py")).partition("_")[0]
-"""Revision of the tables of :mod:`orchestrator.persistence.models`."""
+"""Revision of the tables of :mod:`orchestrator.persistence.batch_models`."""
 _VERSION = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
 _OLDEST = "0001"
 """The revision of databases from before migrations existed."""

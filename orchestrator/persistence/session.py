@@ -28,8 +28,8 @@ from sqlalchemy.exc import TimeoutError as PoolTimeout
 from sqlalchemy.orm import ORMExecuteState, Session
 
 from orchestrator.domain.errors import Unavailable
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.job_counts import JobCounts, note_counts
-from orchestrator.persistence.models import Attempt, Job, Node
 from orchestrator.persistence.schema import NEWEST, NewerSchema, bring_up_to_date, schema_of
 from orchestrator.persistence.updates import write_changes
 from orchestrator.persistence.urls import connect_args, database_url, is_in_memory, shown

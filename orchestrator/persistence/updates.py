@@ -10,7 +10,7 @@ from typing import Any, cast
 from sqlalchemy import Table, Update, bindparam, update
 from sqlalchemy.orm import InstanceState, LoaderCallableStatus, Session, attributes
 
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 
 _BATCHED: tuple[type[Any], ...] = (Job, Attempt, Node)
 """Tables whose rows change together. Their keys never change."""

@@ -15,7 +15,7 @@ from orchestrator.scheduling.pass_cache import NO_ROOM, PassCache
 from orchestrator.scheduling.quota import quota_of
 from orchestrator.scheduling.reasons import QueueOrder, WaitReport
 from orchestrator.scheduling.reservation import Holder, Reservation, end_of, holder_of, reserve, victims
-from orchestrator.scheduling.snapshot import Head, Leading, Moment, Queue, Snapshot, Turns, Waiting
+from orchestrator.scheduling.snapshot import Leading, Moment, Queue, QueueHead, RoundRobin, Snapshot, Waiting
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +53,7 @@ class Decisions:
     report: WaitReport
     leading: Mapping[str, Leading]
     """By queue; for the next snapshot."""
-    turns: Turns
+    turns: RoundRobin
     """For the next snapshot."""
 
 
@@ -99,7 +99,7 @@ class _Pass:
         self.preempts: list[Preempt] = []
         self.cancels: list[Cancel] = []
         self.leading: dict[str, Leading] = {}
-        self.served, self.heads = dict(snapshot.turns.served), dict[str, Head]()
+        self.served, self.heads = dict(snapshot.turns.served), dict[str, QueueHead]()
 
     def run(self) -> Decisions:
         jobs: defaultdict[str, list[Waiting]] = defaultdict(list)
@@ -110,7 +110,7 @@ class _Pass:
         for _, equal in groupby(names, key=lambda name: queues[name].priority):
             self._serve([self._line(queues[name], jobs[name]) for name in equal])
         for name in jobs.keys() - queues.keys():
-            self.orders[name] = QueueOrder(dispatch_order(None, jobs[name], {}, Turns(), bool), None)
+            self.orders[name] = QueueOrder(dispatch_order(None, jobs[name], {}, RoundRobin(), bool), None)
         report = WaitReport(self.now, self.orders, self.reservations, self.free, self.preempts, self.snapshot.drift)
         return Decisions(
             tuple(self.starts),
@@ -118,7 +118,7 @@ class _Pass:
             tuple(self.cancels),
             report,
             self.leading,
-            Turns({key: at for key, at in self.served.items() if key[0] in queues}, self.heads),
+            RoundRobin({key: at for key, at in self.served.items() if key[0] in queues}, self.heads),
         )
 
     def _line(self, queue: Queue, jobs: Sequence[Waiting]) -> _Line:
@@ -214,7 +214,7 @@ class _Pass:
         if possible and queue.name not in self.heads:
             before = self.snapshot.turns.heads.get(queue.name)
             if before is None or before.job != job.job:
-                before = Head(job.job, (self.now, len(self.heads)))
+                before = QueueHead(job.job, (self.now, len(self.heads)))
             self.heads[queue.name] = before
         ces = tuple(
             ce

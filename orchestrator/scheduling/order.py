@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from operator import attrgetter
 from typing import TypeVar
 
-from orchestrator.scheduling.snapshot import FairShare, Moment, Queue, Turns, Waiting
+from orchestrator.scheduling.snapshot import FairShare, Moment, Queue, RoundRobin, Waiting
 
 _T = TypeVar("_T")
 _NOMINAL = 60.0
@@ -45,7 +45,7 @@ def dispatch_order(
     queue: Queue | None,
     jobs: Iterable[Waiting],
     usage: Mapping[tuple[str, str], float],
-    turns: Turns,
+    turns: RoundRobin,
     can_start: Callable[[Waiting], bool],
 ) -> list[Waiting]:
     """The queue's jobs, the first to be served first.
@@ -63,7 +63,9 @@ def dispatch_order(
     return ordered if queue is None else _by_owners(queue, ordered, turns, can_start)
 
 
-def _by_owners(queue: Queue, jobs: list[Waiting], turns: Turns, can_start: Callable[[Waiting], bool]) -> list[Waiting]:
+def _by_owners(
+    queue: Queue, jobs: list[Waiting], turns: RoundRobin, can_start: Callable[[Waiting], bool]
+) -> list[Waiting]:
     """Jobs, which come by age, so that their owners take turns; the head of the last pass stays the first, lest it never gets its room."""
     if len({job.owner for job in jobs}) < 2:
         return jobs
@@ -86,7 +88,7 @@ def turn(served: Moment | None, oldest: Waiting) -> tuple[Moment, str]:
     return max(served or (0, 0), (oldest.created_at, 0)), oldest.job
 
 
-def head_of(queue: Queue, jobs: Iterable[Waiting], turns: Turns) -> Waiting | None:
+def head_of(queue: Queue, jobs: Iterable[Waiting], turns: RoundRobin) -> Waiting | None:
     """The job, among these, for which the last pass had no room first; None where it has left them."""
     head = turns.heads.get(queue.name)
     return next((job for job in jobs if job.job == head.job), None) if head else None

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.hosts import Host, Placement
-from orchestrator.scheduling.snapshot import Queue, Running, Waiting
+from orchestrator.scheduling.snapshot import Queue, RunningGang, Waiting
 
 _FORGOTTEN = 1.0
 """Past use [resource-seconds] below which a share counts as inactive: decay alone never ends."""
@@ -43,7 +43,7 @@ class Quota:
 
 
 def quota_of(
-    queue: Queue, waiting: Iterable[Waiting], running: Sequence[Running], usage: Mapping[tuple[str, str], float]
+    queue: Queue, waiting: Iterable[Waiting], running: Sequence[RunningGang], usage: Mapping[tuple[str, str], float]
 ) -> Quota | None:
     """The queue's quota; None for a queue without a reservation.
 

@@ -13,7 +13,7 @@ from orchestrator.domain.hosts import Placement
 from orchestrator.scheduling.free_resources import Allocation, BackfillWindow, FreeResources
 from orchestrator.scheduling.order import score
 from orchestrator.scheduling.placement import less
-from orchestrator.scheduling.snapshot import Running, Snapshot, Waiting
+from orchestrator.scheduling.snapshot import RunningGang, Snapshot, Waiting
 
 _FOREVER = 4_000_000_000_000
 """An end beyond this (the year 2096) [ms] counts as unknown."""
@@ -59,7 +59,7 @@ def end_of(now: int, started_at: int | None, timeout: int | None) -> float:
     return end if end < _FOREVER else inf
 
 
-def holder_of(gang: Running, now: int, ending: bool) -> Holder:
+def holder_of(gang: RunningGang, now: int, ending: bool) -> Holder:
     end = now if ending else end_of(now, gang.started_at, gang.timeout)
     since = now if gang.started_at is None else gang.started_at
     return Holder(end, since, gang.job, gang.name, gang.compute_environment, gang.placements, ending)
@@ -113,7 +113,7 @@ def reserve(job: Waiting, ces: tuple[str, ...], free: FreeResources, holders: It
 
 def victims(
     job: Waiting, share_score: float, ces: tuple[str, ...], free: FreeResources, snapshot: Snapshot, ending: set[str]
-) -> list[Running]:
+) -> list[RunningGang]:
     """Gangs to preempt so that the job can start: no more than needed, and none if that would not suffice.
 
     Of those that may be preempted the least important go first: lowest queue priority, lowest job priority, youngest.
@@ -149,7 +149,7 @@ def victims(
     return chosen
 
 
-def _may_preempt(job: Waiting, share_score: float, gang: Running, snapshot: Snapshot) -> bool:
+def _may_preempt(job: Waiting, share_score: float, gang: RunningGang, snapshot: Snapshot) -> bool:
     """Whether the job is more important than the gang and, once the gang waits again, is served before it.
 
     Without the second condition the gang would preempt the job in turn, and so on: in a queue that is first in,
@@ -166,12 +166,12 @@ def _may_preempt(job: Waiting, share_score: float, gang: Running, snapshot: Snap
     return share == other or (share_score, share) < (score(mine, other, snapshot.usage), other)
 
 
-def _importance(gang: Running, snapshot: Snapshot) -> tuple[int, int, float, str]:
+def _importance(gang: RunningGang, snapshot: Snapshot) -> tuple[int, int, float, str]:
     youth = -inf if gang.started_at is None else -gang.started_at
     return snapshot.queues[gang.queue].priority, gang.priority, youth, gang.job
 
 
-def _fits_after(gangs: Sequence[Running], shape: Shape, ces: tuple[str, ...], free: FreeResources) -> bool:
+def _fits_after(gangs: Sequence[RunningGang], shape: Shape, ces: tuple[str, ...], free: FreeResources) -> bool:
     then = free.copy()
     for gang in gangs:
         then.release(gang.compute_environment, gang.placements)

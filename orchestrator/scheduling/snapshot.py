@@ -33,7 +33,7 @@ class Waiting:
 
 
 @dataclass(frozen=True, slots=True)
-class Running:
+class RunningGang:
     """A gang that holds resources, from its launch until no process of it is left."""
 
     job: str
@@ -115,7 +115,7 @@ Moment = tuple[int, int]
 
 
 @dataclass(frozen=True, slots=True)
-class Head:
+class QueueHead:
     """The first job of a queue for which there was no room."""
 
     job: str
@@ -123,12 +123,12 @@ class Head:
 
 
 @dataclass(frozen=True)
-class Turns:
+class RoundRobin:
     """What a pass remembers of those before it, so that owners and queues take turns."""
 
     served: Mapping[tuple[str, str | None], Moment] = field(default_factory=dict)
     """(queue, owner) → when a job of theirs was started last."""
-    heads: Mapping[str, Head] = field(default_factory=dict)
+    heads: Mapping[str, QueueHead] = field(default_factory=dict)
     """By queue."""
 
 
@@ -144,12 +144,12 @@ class Snapshot:
     queues: Mapping[str, Queue]
     waiting: Iterable[Waiting]
     """In any order."""
-    running: Sequence[Running]
+    running: Sequence[RunningGang]
     usage: Mapping[tuple[str, str], float]
     """(queue, share) → resource-seconds, decayed to now; a job without a share counts under the share ``""``."""
     leading: Mapping[str, Leading] = field(default_factory=dict)
     """By queue, of the last pass."""
-    turns: Turns = field(default_factory=Turns)
+    turns: RoundRobin = field(default_factory=RoundRobin)
     """As the last pass has left them."""
     drift: int = 0
     """Difference of Unix time to the pass's clock [ms]."""

@@ -1,6 +1,6 @@
 """Automatic evaluations: jobs that the controller submits beside a training whose spec has a section ``evaluation``.
 
-The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.models.AutomaticEvaluation`), which changes in
+The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.batch_models.AutomaticEvaluation`), which changes in
 the transaction that adds the job: a controller that is killed at any moment neither loses nor doubles an evaluation. A training never
 waits for one, and the reconcile loop neither: this has threads for itself.
 """
@@ -20,12 +20,12 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.controller import Controller
-from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain.errors import ClientError, SpecError, Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import FRESH
 from orchestrator.engines.toolkit.backoff import Backoff
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import is_of_earlier_run
 from orchestrator.services.context import Context, Known, with_store
@@ -276,7 +276,7 @@ def _counted(row: AutomaticEvaluation | None, training: _Training, checkpoints: 
     return Counted(row.seen, row.waiting, row.passed)
 
 
-def _row(session: Session, training: _Training, counted: Counted, found: RunFacts) -> AutomaticEvaluation:
+def _row(session: Session, training: _Training, counted: Counted, found: ObservedRun) -> AutomaticEvaluation:
     row = session.get(AutomaticEvaluation, training.run.name)
     if row is None:
         row = AutomaticEvaluation(run=training.run.name)

@@ -18,7 +18,7 @@ from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
 from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal

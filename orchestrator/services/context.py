@@ -13,11 +13,11 @@ from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
-from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ClientError, RequestError
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Job, JobDefinition, JobQueue, RunRecord
+from orchestrator.persistence.batch_models import Job, JobDefinition, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
 from orchestrator.services.arns import plain_name
@@ -104,7 +104,7 @@ class Context:
         self.controller.access.beginning[name] = copy
         self.read(("publish", name), body)
 
-    def found(self, name: str) -> RunFacts:
+    def found(self, name: str) -> ObservedRun:
         """The run of that name, as it is in the store. Raises ClientError where no run can have it, StoreNeeded."""
         run = self.run(name)
         return self.read(("run", name), lambda: facts_of(run))

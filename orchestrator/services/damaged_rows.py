@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import named
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 
 DAMAGED = "the job's row in the database is damaged"
 

@@ -8,7 +8,7 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.domain.gang import GangSpec
-from orchestrator.persistence.models import JobDefinition
+from orchestrator.persistence.batch_models import JobDefinition
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation
 from orchestrator.services.texts import check_texts

@@ -8,7 +8,7 @@ from typing import Any
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
 from orchestrator.services.spec_submission import inherited, submit_spec

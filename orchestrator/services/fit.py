@@ -10,7 +10,7 @@ from orchestrator.control.controller import Controller
 from orchestrator.control.snapshot import fit_in_queue
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.gang import GangSpec, gang_needs
-from orchestrator.persistence.models import JobQueue
+from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.scheduling.fit import Fit
 from orchestrator.services.context import queue_names
 from orchestrator.services.permissions import Actor

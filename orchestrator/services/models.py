@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.models import RunRecord
+from orchestrator.persistence.batch_models import RunRecord
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import owner_of_run, permitted_run, using
 from orchestrator.services.permissions import Actor, Operation

@@ -32,7 +32,7 @@ from typing import Any
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import named
-from orchestrator.persistence.models import (
+from orchestrator.persistence.batch_models import (
     ComputeEnvironment,
     Job,
     JobDefinition,

@@ -8,7 +8,7 @@ from typing import Any
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.retention import RunNeeded
-from orchestrator.control.retention_looks import Place, Whose
+from orchestrator.control.retention_looks import PassCursor, Whose
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.retention import age_of
 from orchestrator.services.context import permitted_run
@@ -71,7 +71,7 @@ def next_part(controller: Controller, actor: Actor, after: str, older_than: str,
         controller.writes.check(adds=False)
     whose = Whose(actor.name, actor.queues)
     try:
-        place = Place.of(after) if after else Place()
+        place = PassCursor.of(after) if after else PassCursor()
     except ValueError as error:
         raise ClientError(str(error)) from None
     try:

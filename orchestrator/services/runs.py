@@ -10,9 +10,9 @@ from sqlalchemy import ColumnElement, select
 from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
-from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from orchestrator.persistence.models import Job, RunRecord
+from orchestrator.persistence.batch_models import Job, RunRecord
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import FoundRun, is_of_earlier_run, jobs_of, owner_of
 from orchestrator.services.context import visible_runs
@@ -58,7 +58,7 @@ def describe_run(controller: Controller, actor: Actor, run: Run) -> dict[str, An
 class StoredRun:
     """What the store has of a run."""
 
-    found: RunFacts
+    found: ObservedRun
     results: Mapping[str, Any]
 
 

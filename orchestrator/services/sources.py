@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec, NodeSpec
-from orchestrator.persistence.models import RunRecord
+from orchestrator.persistence.batch_models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.services.context import Context, archived, permitted_run, release
@@ -31,7 +31,7 @@ _TEACHER = "train.rsl_rl.teacher_checkpoint"
 
 
 @dataclass(frozen=True, order=True)
-class Source:
+class SourceRun:
     """A run that a job reads."""
 
     run: str
@@ -43,7 +43,7 @@ class Source:
     """Of a teacher: run and checkpoint as the spec has them."""
 
 
-def sources_of(gang: GangSpec) -> list[Source]:
+def sources_of(gang: GangSpec) -> list[SourceRun]:
     """The sources that a job reads; each node reads the spec of its own environment. Raises ClientError."""
     nodes = {id(node): node for node in gang.nodes}
     return sorted({source for node in nodes.values() for source in _sources(node)})
@@ -154,7 +154,7 @@ def hold_teacher(context: Context, run: str, needed: TeacherNeeded) -> None:
         context.publish(run, copy, partial(copy.publish, context.run(run).path))
 
 
-def _is_held(context: Context, gang: GangSpec, source: Source) -> bool:
+def _is_held(context: Context, gang: GangSpec, source: SourceRun) -> bool:
     """Whether the run has the teacher: in a checkpoint of its own, in the weights with which it begins, or as a copy."""
     if context.making is not None:
         return _has_teacher(context.making.source, source)
@@ -170,16 +170,16 @@ def _is_held(context: Context, gang: GangSpec, source: Source) -> bool:
     return any(_is_meant(each, source) for each in list_checkpoints(run.teacher(source.run)))
 
 
-def _has_teacher(weights: Checkpoint, source: Source) -> bool:
+def _has_teacher(weights: Checkpoint, source: SourceRun) -> bool:
     settings = weights.manifest.get("settings")
     return isinstance(settings, dict) and settings.get("teacher_checkpoint") == source.reference
 
 
-def _is_meant(checkpoint: Checkpoint, source: Source) -> bool:
+def _is_meant(checkpoint: Checkpoint, source: SourceRun) -> bool:
     return source.checkpoint in ("", str(checkpoint.iteration), checkpoint.name)
 
 
-def _checkpoint(run: Run, source: Source) -> Checkpoint:
+def _checkpoint(run: Run, source: SourceRun) -> Checkpoint:
     """The newest checkpoint that a teacher's reference means. Raises ClientError."""
     checkpoints = list_checkpoints(run)
     if not checkpoints:
@@ -193,7 +193,7 @@ def _checkpoint(run: Run, source: Source) -> Checkpoint:
     return meant[-1]
 
 
-def _sources(node: NodeSpec) -> Iterator[Source]:
+def _sources(node: NodeSpec) -> Iterator[SourceRun]:
     try:
         sections = node.spec or {}
     except (ValueError, RecursionError):
@@ -201,7 +201,7 @@ def _sources(node: NodeSpec) -> Iterator[Source]:
     for kind in (*plugins.evaluating(), "export", "record", "render"):
         section = sections.get(kind)
         if isinstance(section, dict) and isinstance(section.get("run"), str):
-            yield Source(section["run"], kind)
+            yield SourceRun(section["run"], kind)
     given: Any = sections
     for part in _TEACHER.split("."):
         given = given.get(part) if isinstance(given, dict) else None
@@ -210,4 +210,4 @@ def _sources(node: NodeSpec) -> Iterator[Source]:
         if found is None:
             raise ClientError(f"{_TEACHER}: expected RUN or RUN@ITERATION, found {shown(given)}")
         iteration = found[2] or ""
-        yield Source(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration, str(given))
+        yield SourceRun(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration, str(given))

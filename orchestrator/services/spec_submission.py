@@ -15,7 +15,7 @@ from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec, gang_needs
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import Job, JobQueue
+from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.services import definitions, submission
 from orchestrator.services.arns import definition_arn
 from orchestrator.services.chosen_checkpoints import CONFLICT

@@ -9,7 +9,7 @@ from sqlalchemy import or_
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import LONGEST_REASON
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Actor, Operation

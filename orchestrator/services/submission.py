@@ -19,9 +19,9 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
 from orchestrator.persistence import log_groups
+from orchestrator.persistence.batch_models import Dependency, Job, JobDefinition, JobQueue, now
 from orchestrator.persistence.gangs import gangs
-from orchestrator.persistence.job_counts import Place, note_rows
-from orchestrator.persistence.models import Dependency, Job, JobDefinition, JobQueue, now
+from orchestrator.persistence.job_counts import ArrayRole, note_rows
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import note_changed
 from orchestrator.services import permissions
@@ -349,7 +349,7 @@ def _insert_children(session: Session, parent: Job, indices: range, state: Mappi
         "array_index": index,
     }
     session.execute(insert(table).from_select(list(values), select(*values.values()), include_defaults=False))
-    note_rows(session, parent.queue, state["status"], Place.CHILD, len(indices))
+    note_rows(session, parent.queue, state["status"], ArrayRole.CHILD, len(indices))
 
 
 def _insert_waits(session: Session, parent: Job, wait: Wait, size: int) -> None:

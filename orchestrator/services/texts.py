@@ -11,7 +11,7 @@ from orchestrator.control.controller import Controller
 from orchestrator.control.kept_texts import references_of
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec
-from orchestrator.persistence.models import now
+from orchestrator.persistence.batch_models import now
 from orchestrator.persistence.own_models import KeptText
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Actor

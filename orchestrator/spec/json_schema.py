@@ -9,7 +9,7 @@ from pydantic import PydanticUserError, TypeAdapter
 from orchestrator.domain.gang import MOST_NODES
 from orchestrator.spec.model import ALGORITHMS, Spec
 from orchestrator.spec.settings import task_config
-from orchestrator.spec.track import track_schema
+from orchestrator.spec.tracking_services import track_schema
 from orchestrator.spec.values import known_tasks
 from shared_store.contract.policy import Contract
 
@@ -23,7 +23,7 @@ def schema() -> dict[str, Any]:
     definitions["NodeRange"] = {
         "anyOf": [{"type": "integer", "minimum": 1, "maximum": MOST_NODES}, definitions["NodeRange"]]
     }
-    definitions["Track"] = track_schema(definitions["Track"])
+    definitions["TrackingServices"] = track_schema(definitions["TrackingServices"])
     definitions["Train"]["properties"]["task"]["examples"] = known_tasks()
     definitions["Train"]["properties"]["algorithm"]["examples"] = list(ALGORITHMS)
     text = {"type": ["string", "number"]}

@@ -37,7 +37,7 @@ from orchestrator.spec.sections import (
     Share,
 )
 from orchestrator.spec.settings import effective_problem, section_of, settings_classes, task_config, train_section
-from orchestrator.spec.track import Track, key_in
+from orchestrator.spec.tracking_services import TrackingServices, key_in
 from orchestrator.spec.values import (
     Argument,
     Duration,
@@ -186,7 +186,7 @@ class _Spec(Section):
     secrets: Secrets = Field(
         default_factory=dict, description="variables and the names of their values, which the controller has"
     )
-    track: Track | None = Field(default=None, description="services that get a training's metrics as well")
+    track: TrackingServices | None = Field(default=None, description="services that get a training's metrics as well")
     image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
     checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
     evaluation: Evaluation | None = Field(default=None, description="of checkpoints, while the job trains")

@@ -15,7 +15,7 @@ WHEELBASE = wp.constant(0.164)
 
 
 @wp.struct
-class Motion:
+class CarMotion:
     """A car in motion.
 
     Attributes:
@@ -54,7 +54,7 @@ def turning(speed: float, steering: float, grip: float) -> float:
 
 @wp.func
 def drive(
-    motion: Motion,
+    motion: CarMotion,
     speed: float,
     steering: float,
     grip: float,
@@ -62,7 +62,7 @@ def drive(
     steering_lag: float,
     seconds: float,
     parts: int,
-) -> Motion:
+) -> CarMotion:
     """The car after some time.
 
     Steering and speed are exact. Heading and position are integrated by Simpson's rule in each of equal parts, where the heading in the

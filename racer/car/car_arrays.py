@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from racer.car.bicycle import WHEELBASE, Motion, drive
+from racer.car.bicycle import WHEELBASE, CarMotion, drive
 from racer.tracks.road import RoadArrays, advance, around, is_open, on_road, project
 from worker.simulation.kinematics import wrapped_angle
 from worker.simulation.robot_arrays import RobotArrays
@@ -178,7 +178,7 @@ def move_car(
     pose = car.poses[world]
     factors = car.factors[world]
     rear = ahead_of(pose, -0.5 * WHEELBASE, 0.0)
-    motion = Motion()
+    motion = CarMotion()
     motion.x = rear[0]
     motion.y = rear[1]
     motion.heading = pose[2]

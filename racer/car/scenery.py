@@ -9,7 +9,7 @@ import warp as wp
 from racer.tracks.arithmetic import Floats, nearest_points, norm
 from racer.tracks.circuit import BOX, Circuit, bounds
 from racer.tracks.geometry import place_at
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 
 GRASS, ASPHALT, BORDER, DASHES = (0.26, 0.55, 0.2), (0.22, 0.23, 0.25), (0.95, 0.95, 0.95), (0.95, 0.75, 0.1)
 CARDBOARD = (0.75, 0.2, 0.12)

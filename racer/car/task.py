@@ -26,7 +26,7 @@ from racer.settings.task import FrontCameraConfig, RacerConfig, RacerPixelsAndSt
 from racer.tracks.checks import BadTrack
 from racer.tracks.circuit import circuit_of
 from racer.tracks.naming import resolve
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 from shared_store.contract.policy import Target
 from shared_store.volume.layout import Run, Store
 from worker.settings.overrides import Refused

@@ -14,7 +14,7 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.job_list import Wanted, page_of_jobs
 from orchestrator.api.native.model_routes import list_models
 from orchestrator.console.forms import Form, Question, body_of, done, sent_form
-from orchestrator.console.live import Recent, Rows, stream
+from orchestrator.console.live import Recent, TableRows, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
@@ -95,7 +95,7 @@ def league(request: Request, name: str, every: bool = Query(default=False)) -> R
 def race_stream(request: Request, name: str) -> Response:
     """The changes in the list of races, as events."""
     actor = actor_of(request)
-    rows = Rows()
+    rows = TableRows()
     look = partial(_races, request, name)
     cases.read_league(controller_of(request), name)
     return stream(request, lambda: rows.changes(_recent.get((actor, name), look), {}), _INTERVAL, stored=True)

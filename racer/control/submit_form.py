@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 
-from orchestrator.console.submit_fields import Field, Group, TaskForm
+from orchestrator.console.submit_fields import Field, FieldGroup, TaskForm
 from orchestrator.spec.settings import task_config
 from racer.control.track_pages import OUTLINE, track_names
 from racer.settings.task import RacerConfig
@@ -26,7 +26,7 @@ def _config(task: str) -> type[RacerConfig] | None:
     return kind if isinstance(kind, type) and issubclass(kind, RacerConfig) else None
 
 
-def _groups(task: str) -> list[Group]:
+def _groups(task: str) -> list[FieldGroup]:
     """Track, action space, reward function, hyperparameters."""
     kind = _config(task)
     assert kind is not None
@@ -47,10 +47,10 @@ def _groups(task: str) -> list[Group]:
     theirs = "DeepRacer's names; they become settings of the algorithm, so give each in one place."
     told = "Python, as DeepRacer has it: def reward_function(params). Empty: the rewards of the task."
     return [
-        Group("Tracks", (tracks,), True),
-        Group("Action space", (Field("train.config.action_space", "code", value=space),), True, hint=hint),
-        Group("Reward function", (reward,), True, hint=told),
-        Group("Hyperparameters", tuple(names), hint=theirs),
+        FieldGroup("Tracks", (tracks,), True),
+        FieldGroup("Action space", (Field("train.config.action_space", "code", value=space),), True, hint=hint),
+        FieldGroup("Reward function", (reward,), True, hint=told),
+        FieldGroup("Hyperparameters", tuple(names), hint=theirs),
     ]
 
 

@@ -82,7 +82,7 @@ class Trial:
 
 
 @dataclass(frozen=True)
-class Race:
+class RaceTrials:
     """The trials of a race.
 
     Attributes:
@@ -161,13 +161,13 @@ class Laps:
         worlds = running.nonzero()[:, 0]
         self._noted.append((time.time(), worlds.cpu(), rows[worlds].cpu()))
 
-    def result(self, played: Episodes, section: Mapping[str, Any], seed: int, facts: Mapping[str, Any]) -> Race:
+    def result(self, played: Episodes, section: Mapping[str, Any], seed: int, facts: Mapping[str, Any]) -> RaceTrials:
         """As :class:`worker.evaluation.evaluation.Watcher` says."""
         return self.race(played, rules_of(section), seed, facts)
 
     def race(
         self, played: Episodes, rules: Mapping[str, Any], seed: int, facts: Mapping[str, Any] | None = None
-    ) -> Race:
+    ) -> RaceTrials:
         """The race that these trials were.
 
         Args:
@@ -194,4 +194,4 @@ class Laps:
         if facts and "settings" in facts:
             trained = facts["algorithm"], facts["settings"], facts["train"].get("worlds", 1)
             documents = model_documents(self._task, *trained)
-        return Race(trials, rules, directions, seed, documents)
+        return RaceTrials(trials, rules, directions, seed, documents)

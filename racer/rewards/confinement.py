@@ -146,7 +146,7 @@ def error_message(error: BaseException) -> str:
     return one_line(error)
 
 
-class Alarm:
+class CallTimeout:
     """Ends a call that takes too long.
 
     Args:

@@ -67,7 +67,7 @@ def main() -> None:
         gc.collect()
         gc.disable()
         try:
-            program = namespaces.Program(asked["source"], file)
+            program = namespaces.RewardProgram(asked["source"], file)
             for _ in cars:
                 printed.count = 0
                 alarm.set(_LOADING)
@@ -86,7 +86,7 @@ def main() -> None:
         late = f"the function did not return within {seconds:g} s"
         return made
 
-    alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
+    alarm, printed = confined.CallTimeout(expired), confined.Printed(flooded)
     # where it does not hold, the guard has refused it
     confined.confine(asked["memory"], keep=(steps.fileno(), out.fileno()))
     cars = range(asked["first"], asked["last"])

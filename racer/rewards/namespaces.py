@@ -200,7 +200,7 @@ def _copied(code: CodeType) -> CodeType:
     )
 
 
-class Program:
+class RewardProgram:
     """The text of a reward function.
 
     Args:

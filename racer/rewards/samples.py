@@ -35,7 +35,7 @@ class Placed:
     speed: float = 0.0
 
 
-class Line:
+class CentreLine:
     """A centre line.
 
     Args:
@@ -125,7 +125,7 @@ def _degrees(angle: float) -> float:
 
 
 def sample(
-    line: Line, car: Placed, objects: Sequence[Placed] = (), *, is_reversed: bool = False, **known: Any
+    line: CentreLine, car: Placed, objects: Sequence[Placed] = (), *, is_reversed: bool = False, **known: Any
 ) -> dict[str, Any]:
     """Sample arguments of a reward function.
 
@@ -200,7 +200,7 @@ class Course:
 
     Attributes:
         name: Of the track; empty: it is none of a job's.
-        points: As :class:`Line` has them.
+        points: As :class:`CentreLine` has them.
         widths: Of the road at each point [m].
         closed: Whether it is a loop.
         objects: On it.
@@ -222,7 +222,7 @@ class Course:
         """Sample inputs with each of which a function may pass: with the job's objects, or without any, and as AWS tries it."""
         if self.objects:
             return [samples(self, self.objects)]
-        line = Line(self.points, self.widths, self.closed)
+        line = CentreLine(self.points, self.widths, self.closed)
         ways = [line.length * (number + 0.5) / SIX for number in range(SIX)]
         six = [Placed(way, 0.25 * line.width(way) * (-1) ** number) for number, way in enumerate(ways)]
         return [samples(self, () if self.name else None), samples(self, six)]
@@ -240,8 +240,8 @@ def samples(course: Course = OVAL, objects: Sequence[Placed] | None = None) -> d
         course: The track.
         objects: On it in all samples; None: three boxes in those in which the car meets some.
     """
-    line = Line(course.points, course.widths, course.closed)
-    share = line.length / Line(OVAL.points).length
+    line = CentreLine(course.points, course.widths, course.closed)
+    share = line.length / CentreLine(OVAL.points).length
 
     def car(way: float, offset: float, turned: float, speed: float) -> Placed:
         way *= share
@@ -269,7 +269,7 @@ def samples(course: Course = OVAL, objects: Sequence[Placed] | None = None) -> d
     }
 
 
-def random_sample(line: Line, chance: random.Random) -> dict[str, Any]:
+def random_sample(line: CentreLine, chance: random.Random) -> dict[str, Any]:
     """Sample inputs drawn at random: anywhere on the track and beside it, with up to :data:`MOST_OBJECTS` objects.
 
     Args:

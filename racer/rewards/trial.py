@@ -45,7 +45,7 @@ def main() -> None:
         line = confined.line_of_frame(sys._getframe(), file)
         end("TEST_FAILURE", f"{now} printed more than {confined.MOST_PRINTED >> 10} KiB of text", line)
 
-    alarm, printed = confined.Alarm(expired), confined.Printed(flooded)
+    alarm, printed = confined.CallTimeout(expired), confined.Printed(flooded)
     if unconfined := confined.confine(cpu=int(4 * asked["seconds"]) + 5, keep=(out.fileno(),)):
         tell(unconfined=unconfined)
         if not asked["anyway"]:
@@ -54,7 +54,7 @@ def main() -> None:
         with confined.printing(printed):
             tell(trying=now)
             alarm.set(limit)
-            car = namespaces.Program(asked["source"], file).car()
+            car = namespaces.RewardProgram(asked["source"], file).car()
             limit = asked["seconds"]
             for name, params in asked["samples"].items():
                 now = f"the sample {name!r}"

@@ -23,7 +23,7 @@ Setting = tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Job:
+class TrainingFacts:
     """The facts on which a hyperparameter's meaning depends.
 
     Attributes:
@@ -53,7 +53,7 @@ class Hyperparameter:
     """
 
     check: Callable[[Any], Any]
-    meaning: Callable[[Any, Job], Meaning] | str
+    meaning: Callable[[Any, TrainingFacts], Meaning] | str
 
 
 def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any], list[str]]:
@@ -78,7 +78,7 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
     checked = {name: _checked(where, str(name), value) for name, value in given.items()}
     worlds = train.get("worlds")
     own = _at(train, ("ppo", "steps"))
-    job = Job(
+    job = TrainingFacts(
         algorithm,
         worlds if isinstance(worlds, int) and worlds > 0 else 1,  # the section's own check follows
         own if isinstance(own, int) and own > 0 else config.ppo.steps,
@@ -98,7 +98,7 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
                 raise Refused((where, name), f"it is {other} here, which is given, too; leave one of them out")
             _put(plain, setting, value)
             if setting == ("ppo", "steps"):
-                job = Job(job.algorithm, job.worlds, value, job.has_camera)
+                job = TrainingFacts(job.algorithm, job.worlds, value, job.has_camera)
         if note:
             notes.append(f"{where}.{name} {given[name]}: {note}")
     return plain, notes
@@ -150,7 +150,7 @@ def _checked(where: str, name: str, value: Any) -> Any:
         raise Refused((where, name), f"expected {error}, found {shown(value)}") from None
 
 
-def _meaning(name: str, value: Any, job: Job) -> Meaning:
+def _meaning(name: str, value: Any, job: TrainingFacts) -> Meaning:
     meaning = KNOWN[name].meaning if name in KNOWN else _UNKNOWN
     return ({}, meaning) if isinstance(meaning, str) else meaning(value, job)
 
@@ -209,7 +209,7 @@ def _one_of(*values: Any) -> Callable[[Any], Any]:
     return check
 
 
-def _batch_size(value: int, job: Job) -> Meaning:
+def _batch_size(value: int, job: TrainingFacts) -> Meaning:
     if job.algorithm == "sac":
         return {("sac", "batch_size"): value}, ""
     parts = [part for part in range(1, job.steps + 1) if job.steps % part == 0]
@@ -221,26 +221,26 @@ def _batch_size(value: int, job: Job) -> Meaning:
     return {("ppo", "minibatches"): best}, note
 
 
-def _num_epochs(value: int, job: Job) -> Meaning:
+def _num_epochs(value: int, job: TrainingFacts) -> Meaning:
     if job.algorithm == "sac":
         return {}, "sac makes no passes over a batch; sac.updates says how often it learns in an iteration"
     return {("ppo", "epochs"): value}, ""
 
 
-def _lr(value: float, job: Job) -> Meaning:
+def _lr(value: float, job: TrainingFacts) -> Meaning:
     if job.algorithm == "sac":
         rates = ("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate")
         return {("sac", rate): value for rate in rates}, ""
     return {("ppo", "learning_rate"): value, ("ppo", "schedule"): "fixed"}, ""
 
 
-def _beta_entropy(value: float, job: Job) -> Meaning:
+def _beta_entropy(value: float, job: TrainingFacts) -> Meaning:
     if job.algorithm == "sac":
         return {}, "it is not used, since the entropy's weight in sac is sac_alpha"
     return {("ppo", "entropy_coef"): value}, ""
 
 
-def _loss_type(value: str, job: Job) -> Meaning:
+def _loss_type(value: str, job: TrainingFacts) -> Meaning:
     if job.algorithm == "sac":
         return {}, "it is not used: sac learns a distribution of the return, by its cross-entropy"
     if value == "huber":
@@ -248,7 +248,7 @@ def _loss_type(value: str, job: Job) -> Meaning:
     return {}, ""
 
 
-def _num_episodes(value: int, job: Job) -> Meaning:
+def _num_episodes(value: int, job: TrainingFacts) -> Meaning:
     if job.algorithm == "sac":
         return {}, "sac learns after every sac.steps control steps of each world, whatever episodes have ended"
     steps = min(max(8 * math.ceil(value * EPISODE / job.worlds / 8), FEWEST_STEPS), MOST_STEPS)
@@ -258,7 +258,7 @@ def _num_episodes(value: int, job: Job) -> Meaning:
     }, f"an iteration is {cars} ({value} episodes of {EPISODE} steps are {value * EPISODE})"
 
 
-def _exploration_type(value: str, job: Job) -> Meaning:
+def _exploration_type(value: str, job: TrainingFacts) -> Meaning:
     if value == "e-greedy":
         raise ValueError("ppo and sac draw actions from the policy itself; use categorical")
     if value == "additive noise" and job.algorithm == "ppo":
@@ -269,7 +269,7 @@ def _exploration_type(value: str, job: Job) -> Meaning:
     return {}, ""
 
 
-def _stack_size(value: int, job: Job) -> Meaning:
+def _stack_size(value: int, job: TrainingFacts) -> Meaning:
     if job.has_camera:
         return {("config", "front", "frames"): value}, ""
     if value > 1:
@@ -277,7 +277,7 @@ def _stack_size(value: int, job: Job) -> Meaning:
     return {}, ""
 
 
-def _sac_alpha(value: float, job: Job) -> Meaning:
+def _sac_alpha(value: float, job: TrainingFacts) -> Meaning:
     if job.algorithm == "ppo":
         return {}, "it is not used by ppo"
     if not value:

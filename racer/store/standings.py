@@ -27,7 +27,7 @@ class BadRace(ValueError):
 
 
 @dataclass(frozen=True)
-class Race:
+class RaceResults:
     """The counted results of a race.
 
     Attributes:
@@ -62,7 +62,7 @@ class Race:
         return _milliseconds(total if ranking == "total" else total / len(self.times))
 
 
-def read_race(race: Any) -> Race:
+def read_race(race: Any) -> RaceResults:
     """The counted results in the key ``race`` of an evaluation's summary. Raises BadRace."""
     if not isinstance(race, Mapping):
         raise BadRace("it is no race: its summary has no key race")
@@ -83,7 +83,7 @@ def read_race(race: Any) -> Race:
             counts[key] += value
         if trial["status"] == LAP_COMPLETE:
             times.append(_lap_time(trial.get("time"), f"{where}.time"))
-    return Race(laps=laps, times=tuple(times), **counts)
+    return RaceResults(laps=laps, times=tuple(times), **counts)
 
 
 def _lap_time(value: Any, where: str) -> float:
@@ -134,7 +134,7 @@ class Contender:
     entry: int
     racer: str
     model: str
-    race: Race | None
+    race: RaceResults | None
     disqualified: str = ""
     problem: str = ""
 

@@ -14,8 +14,8 @@ from racer.store import tracks as stored
 from racer.tracks.generator import make_random
 from racer.tracks.naming import keep, resolve
 from racer.tracks.presets import PRESETS, make_preset
+from racer.tracks.race_track import Track
 from racer.tracks.route_file import read_file, to_bytes
-from racer.tracks.track import Track
 from shared_store.volume.files import write_atomic
 from shared_store.volume.layout import Store
 from worker.settings.errors import UserError

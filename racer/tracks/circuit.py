@@ -11,7 +11,7 @@ import numpy as np
 from racer.tracks.arithmetic import Floats
 from racer.tracks.geometry import place_at, project
 from racer.tracks.obstacles import ObstacleConfig
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 from shared_store.contract.error_text import counted
 from worker.settings.overrides import Refused
 

@@ -13,7 +13,7 @@ import numpy as np
 from racer.tracks.arithmetic import Floats, left_of, norm, sine_cosine
 from racer.tracks.checks import BadTrack, radii_of
 from racer.tracks.presets import SPACING, WIDTH, check_room, check_wanted, waypoints
-from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, Direction, Track
+from racer.tracks.race_track import CLOCKWISE, COUNTER_CLOCKWISE, Direction, Track
 
 LENGTH = 30.0
 """Of the centre line [m]."""

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from racer.tracks.arithmetic import Floats, cross, meetings, nearest, norm, segments_of
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from racer.store import tracks as stored
 from racer.tracks.checks import BadTrack
 from racer.tracks.generator import LARGEST_SEED, make_random
 from racer.tracks.presets import PRESETS, make_preset
+from racer.tracks.race_track import Track
 from racer.tracks.route_file import from_bytes, to_bytes
-from racer.tracks.track import Track
 from shared_store.contract.error_text import nearest, shown
 from shared_store.volume.layout import Store
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from racer.tracks.geometry import place_at
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 
 _ASPHALT, _BORDER, _CENTER, _START = "#d9dce1", "#30343b", "#e08a1e", "#c0202a"
 _SIDE = 6.0

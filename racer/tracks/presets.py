@@ -9,7 +9,7 @@ import numpy as np
 
 from racer.tracks.arithmetic import Floats, left_of, sine_cosine
 from racer.tracks.checks import LENGTHS, WAYPOINTS, WIDTHS, BadTrack
-from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, DIRECTIONS, Direction, Track
+from racer.tracks.race_track import CLOCKWISE, COUNTER_CLOCKWISE, DIRECTIONS, Direction, Track
 from shared_store.contract.error_text import nearest
 
 WIDTH = 1.0

@@ -13,7 +13,7 @@ import warp as wp
 
 from racer.tracks.arithmetic import nearest_points, norm
 from racer.tracks.geometry import project as project_all
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 
 wp.set_module_options({"enable_backward": False})
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from racer.store.tracks import LARGEST
 from racer.tracks.arithmetic import Floats, norm
 from racer.tracks.checks import RINGS, SHORTEST_STEP, WAYPOINTS, BadTrack, at, check_numbers, inside, left_of_line
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 from shared_store.contract.error_text import counted
 from shared_store.volume.files import DamagedFile, open_regular
 

@@ -14,13 +14,13 @@ from shared_store.contract.error_text import counted
 from shared_store.volume.paired_episodes import are_paired, paired, read_returns
 
 COLUMNS = ("RUNS", "SEEDS", "TASK", "ITERATION", "STEPS", "REWARD", "LENGTH", "EVALUATED", "SUCCESS")
-"""Of the table; see :meth:`Group.cells`."""
+"""Of the table; see :meth:`RunGroup.cells`."""
 POINTS = 200
 """Number of points in the curve of a group."""
 
 
 @dataclass(frozen=True)
-class RunFacts:
+class ComparedRun:
     """The data of one run to compare.
 
     Attributes:
@@ -61,10 +61,10 @@ class RunFacts:
 
 
 @dataclass(frozen=True)
-class Group:
+class RunGroup:
     """Runs whose specs differ only in name and seed."""
 
-    runs: Sequence[RunFacts]
+    runs: Sequence[ComparedRun]
 
     @property
     def label(self) -> str:
@@ -162,7 +162,7 @@ def facts_of(
     records: Sequence[Mapping[str, Any]],
     checkpoints: Sequence[Mapping[str, Any]],
     evaluations: Sequence[Mapping[str, Any]],
-) -> RunFacts:
+) -> ComparedRun:
     """The compared facts of a run, from the native API's answers about it, its metrics, its checkpoints and its evaluations.
 
     It is judged by its best checkpoint that has an evaluation, else by the last one that has.
@@ -172,28 +172,28 @@ def facts_of(
     of_it = [each for each in evaluations if judged and each["checkpoint"] == judged["name"]]
     called = judged["evaluated"]["name"] if judged else None
     evaluation = next((each for each in evaluations if each["name"] == called), None)
-    return RunFacts(described["run"], described["spec"] or {}, records, evaluation, of_it, described["path"])
+    return ComparedRun(described["run"], described["spec"] or {}, records, evaluation, of_it, described["path"])
 
 
-def grouped(runs: Iterable[RunFacts]) -> list[Group]:
+def grouped(runs: Iterable[ComparedRun]) -> list[RunGroup]:
     """The runs in groups, in the order of their first ones."""
-    groups: dict[str, list[RunFacts]] = {}
+    groups: dict[str, list[ComparedRun]] = {}
     for run in runs:
         spec = {key: value for key, value in run.spec.items() if key not in ("name", "train")}
         train = {key: value for key, value in run.train.items() if key != "seed"}
         # without a spec, runs can't be compared
         key = json.dumps([spec, train], sort_keys=True) if run.train else run.name
         groups.setdefault(key, []).append(run)
-    return [Group(each) for each in groups.values()]
+    return [RunGroup(each) for each in groups.values()]
 
 
-def same_episodes(new: RunFacts, old: RunFacts) -> tuple[Mapping[str, Any], Mapping[str, Any]] | None:
+def same_episodes(new: ComparedRun, old: ComparedRun) -> tuple[Mapping[str, Any], Mapping[str, Any]] | None:
     """An evaluation of each of two runs on the same episodes: the pair with the most common episodes; None without any."""
     both = [(a, b) for a in new.evaluations for b in old.evaluations if are_paired(a, b)]
     return max(both, key=lambda pair: min(pair[0]["episodes"], pair[1]["episodes"]), default=None)
 
 
-def versus(group: Group, first: Group) -> dict[str, Any] | None:
+def versus(group: RunGroup, first: RunGroup) -> dict[str, Any] | None:
     """The difference of a single run from the first one in the same episodes; None where they have none, or these can't be read here.
 
     Returns:

@@ -34,7 +34,7 @@ _RESERVE = 256 << 20
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
 
 
-class Segment(NamedTuple):
+class LogSegment(NamedTuple):
     """One file of a log."""
 
     start: int
@@ -72,12 +72,12 @@ class Chunk(NamedTuple):
     """The file was truncated or replaced: ``data`` is from its new beginning."""
 
 
-def log_segments(directory: Path) -> dict[str, list[Segment]]:
+def log_segments(directory: Path) -> dict[str, list[LogSegment]]:
     """The regular files of every log in ``directory`` by the name of its head, in order.
 
     Empty if the directory does not exist or is a link.
     """
-    found: dict[str, list[Segment]] = {}
+    found: dict[str, list[LogSegment]] = {}
     try:
         refuse_links(directory, _LEVELS)
         with os.scandir(directory) as entries:
@@ -86,21 +86,21 @@ def log_segments(directory: Path) -> dict[str, list[Segment]]:
         return found
     for name in names:
         if match := _TAIL.fullmatch(name):
-            found.setdefault(match[1], []).append(Segment(int(match[2]), int(match[3]), directory / name))
+            found.setdefault(match[1], []).append(LogSegment(int(match[2]), int(match[3]), directory / name))
         elif _HEAD.fullmatch(name):
-            found.setdefault(name, []).append(Segment(0, 0, directory / name))
+            found.setdefault(name, []).append(LogSegment(0, 0, directory / name))
     for segments in found.values():
         segments.sort()
     return found
 
 
-def segments_of(path: Path) -> list[Segment]:
+def segments_of(path: Path) -> list[LogSegment]:
     """The files of the log whose head is ``path``, in order; empty if it has none yet."""
     return log_segments(path.parent).get(path.name, [])
 
 
 def read_log(
-    segments: Sequence[Segment],
+    segments: Sequence[LogSegment],
     position: int,
     most: int,
     identity: Identity = UNKNOWN,
@@ -185,7 +185,7 @@ class LogWriter:
         """The reason why the last :meth:`append` did not write everything."""
         refuse_links(path.parent, _LEVELS)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._segments = segments_of(path) or [Segment(0, 0, path)]
+        self._segments = segments_of(path) or [LogSegment(0, 0, path)]
         self._unchecked, self._interval = 0, 0
         last = self._segments[-1]
         self._lines = last.lines + (count_lines(last.path) if last.start else 0)
@@ -252,7 +252,7 @@ class LogWriter:
             end = data.index(b"\n", start) + 1  # one line that is longer than that
         return data[start:end] if end > start else b""
 
-    def _open(self, segment: Segment) -> None:
+    def _open(self, segment: LogSegment) -> None:
         self._file = os.open(segment.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
         self._size = os.fstat(self._file).st_size
 
@@ -290,7 +290,7 @@ class LogWriter:
     def _rotate(self) -> None:
         last = self._segments[-1]
         start = last.start + os.fstat(self._file).st_size
-        following = Segment(start, self._lines, self.path.with_name(f"{self.path.name}.{start:015d}.{self._lines}"))
+        following = LogSegment(start, self._lines, self.path.with_name(f"{self.path.name}.{start:015d}.{self._lines}"))
         before = self._file
         self._open(following)
         os.close(before)

@@ -18,7 +18,7 @@ from typing import Protocol
 
 from shared_store.volume.files import DamagedFile, open_regular, refuse_links
 from shared_store.volume.layout import Run
-from shared_store.volume.log_files import UNKNOWN, Chunk, Identity, Segment, left_out, log_segments, read_log
+from shared_store.volume.log_files import UNKNOWN, Chunk, Identity, LogSegment, left_out, log_segments, read_log
 from shared_store.volume.logs import LIMIT_REACHED, REPLACED, LogLine, lines_in, timestamp
 
 Places = dict[str, int]
@@ -73,7 +73,7 @@ class NodeLog:
     def key(self) -> Key:
         return self.attempt, self.node
 
-    def fill(self, segments: Sequence[Segment], most: int, rank: int | None = None) -> None:
+    def fill(self, segments: Sequence[LogSegment], most: int, rank: int | None = None) -> None:
         """Read on in the files if every line so far has been returned."""
         if self.read:
             return
@@ -168,9 +168,9 @@ class Chosen:
         """The chosen attempts that have a log. Raises OSError."""
         return [each for each in attempts_with_logs(self.run, self.job) if self.attempt in (None, each)]
 
-    def logs(self, attempt: int | None = None) -> dict[Key, list[Segment]]:
+    def logs(self, attempt: int | None = None) -> dict[Key, list[LogSegment]]:
         """The files of each log, by attempt and node, in this order; of one attempt, or of all. Raises OSError."""
-        found: dict[Key, list[Segment]] = {}
+        found: dict[Key, list[LogSegment]] = {}
         for number in self.attempts() if attempt is None else [attempt]:
             found |= {log: files for log, files in logs_of(self.run, self.job, number).items() if self.has(log)}
         return found
@@ -282,7 +282,7 @@ def attempts_with_logs(run: Run, job: str) -> list[int]:
         return []
 
 
-def logs_of(run: Run, job: str, attempt: int) -> dict[Key, list[Segment]]:
+def logs_of(run: Run, job: str, attempt: int) -> dict[Key, list[LogSegment]]:
     """The files of the logs of one attempt, by node. Raises OSError."""
     found = {}
     for name, segments in log_segments(run.logs(job, attempt)).items():
@@ -291,7 +291,7 @@ def logs_of(run: Run, job: str, attempt: int) -> dict[Key, list[Segment]]:
     return dict(sorted(found.items()))
 
 
-def log_end(segments: Sequence[Segment]) -> int:
+def log_end(segments: Sequence[LogSegment]) -> int:
     """The position after the last whole line of a log. Raises OSError."""
     start, _, path = segments[-1]
     size = start + path.stat().st_size
@@ -302,7 +302,7 @@ def log_end(segments: Sequence[Segment]) -> int:
     return start
 
 
-def piece_before(segments: Sequence[Segment], place: int, most: int) -> tuple[int, bytes]:
+def piece_before(segments: Sequence[LogSegment], place: int, most: int) -> tuple[int, bytes]:
     """Up to ``most`` bytes of one file that end at ``place``, and the position of the first one."""
     start, _, path = next((each for each in reversed(segments) if each.start < place), segments[0])
     begin = max(start, place - most)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 
-from shared_store.volume.log_files import Segment, left_out, read_log
+from shared_store.volume.log_files import LogSegment, left_out, read_log
 from shared_store.volume.log_view import CHUNK, WHOLE, Chosen, Key, LogView, Places, log_end, piece_before
 from shared_store.volume.logs import LIMIT_REACHED, LogLine, lines_in
 
@@ -55,7 +55,7 @@ class _Back:
 
     attempt: int
     node: int
-    segments: Sequence[Segment]
+    segments: Sequence[LogSegment]
     place: int
     lines: list[tuple[int, LogLine]] = field(default_factory=list)
     """Those that are chosen, with the positions before them."""
@@ -161,7 +161,7 @@ def lines_after(chosen: Chosen, place: Mapping[str, int], most: int = LINES_A_WI
 
 
 @dataclass(frozen=True)
-class Found:
+class FoundLines:
     """The lines that a search has found, and the place where it continues."""
 
     lines: list[LogLine]
@@ -169,13 +169,13 @@ class Found:
     is_over: bool
 
 
-def search(chosen: Chosen, text: str, place: Mapping[str, int], most: int = 100) -> Found:
+def search(chosen: Chosen, text: str, place: Mapping[str, int], most: int = 100) -> FoundLines:
     """Lines that have ``text``, whatever its case (of ASCII), log by log from ``place`` on; reads up to 32 MiB. Raises OSError."""
     needle = text.lower()
     return _search(chosen, (text.encode().lower(),), lambda line: needle in line.lower(), place, most)
 
 
-def first_error(chosen: Chosen, place: Mapping[str, int]) -> Found:
+def first_error(chosen: Chosen, place: Mapping[str, int]) -> FoundLines:
     """The first line of each log that tells of an error: a traceback, an exception, ``ERROR``; reads up to 32 MiB. Raises OSError."""
     return _search(chosen, _OF_ERRORS, lambda line: _ERROR.search(line) is not None, place, 1, each=True)
 
@@ -187,7 +187,7 @@ def _search(
     place: Mapping[str, int],
     most: int,
     each: bool = False,
-) -> Found:
+) -> FoundLines:
     """``each``: whether ``most`` lines of each log are wanted, and not of all together."""
     found: list[LogLine] = []
     reached, left = dict(place), _SEARCHED
@@ -210,13 +210,13 @@ def _search(
             reached[key] = hits[-1].position if is_enough else chunk.start + len(data)
             left -= len(data)
             if is_enough and not each:
-                return Found(found, reached, False)
+                return FoundLines(found, reached, False)
             if is_enough:
                 reached[key] = log_end(segments)
                 break
             if left <= 0:
-                return Found(found, reached, False)
-    return Found(found, reached, True)
+                return FoundLines(found, reached, False)
+    return FoundLines(found, reached, True)
 
 
 def _hits(

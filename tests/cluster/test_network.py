@@ -19,7 +19,7 @@ from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
 from shared_store.volume.log_view import LogView
 from shared_store.volume.metrics import read_metrics
-from shared_store.volume.outcomes import read_outcome
+from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import PATIENCE, REPOSITORY, wait_for
 from tests.support.engines.bench import make_gang
 from tests.support.faults.link import ADDRESSES, Link

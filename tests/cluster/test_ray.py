@@ -17,7 +17,7 @@ from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.engines.ray.folder import Folder
 from orchestrator.engines.toolkit.looks import status_of
 from shared_store import __version__
-from shared_store.volume.outcomes import read_outcome
+from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import wait_for
 from tests.support.engines.ray_bench import RayBench
 from tests.support.engines.ray_cluster import RAY, RayCluster

@@ -13,11 +13,11 @@ import pytest
 
 from orchestrator.engines.api import EngineError, NotYet
 from orchestrator.engines.slurm import engine as slurm
-from orchestrator.engines.slurm.commands import call
 from orchestrator.engines.slurm.engine import SlurmEngine
+from orchestrator.engines.slurm.slurm_commands import call
 from orchestrator.engines.toolkit.looks import status_of
 from shared_store.volume.checkpoints import list_checkpoints
-from shared_store.volume.outcomes import read_outcome
+from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import MUSTER, PATIENCE, Serving, wait_for
 from tests.support.engines.sites import POLITE
 from tests.support.engines.slurm_bench import SlurmBench, slurm_bench

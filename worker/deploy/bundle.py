@@ -41,7 +41,7 @@ from shared_store.volume.files import remove_tree, write_json
 from shared_store.volume.layout import Run
 from worker.deploy import parity, rollouts
 from worker.deploy.leapp_description import LEAPP, leapp_description
-from worker.deploy.model import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
+from worker.deploy.model_file import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
 from worker.deploy.robots import add_robot
 from worker.tasks.run.declared import DeclaredTask
 
@@ -70,7 +70,7 @@ def bundle_files(
     exported: ExportedPolicy,
     contract: Contract,
     algorithm: str,
-    recordings: Mapping[str, parity.Recording],
+    recordings: Mapping[str, parity.RecordedObservations],
     run_path: str = "",
 ) -> Files:
     """Write a policy to files and compare them with it on the recordings, and on the policy's own sample.
@@ -91,7 +91,7 @@ def bundle_files(
     compared = {**recordings, "made_up": parity.made_up(exported)}
     for recording in compared.values():
         if len(recording.begins) > 1:
-            first = parity.Recording(
+            first = parity.RecordedObservations(
                 {name: each[: parity.STEPS] for name, each in recording.inputs.items()},
                 recording.begins[: parity.STEPS],
             )

@@ -14,7 +14,7 @@ import yaml
 from shared_store import __version__
 from shared_store.contract.policy import Contract, Group
 from shared_store.volume.bundles import CONTRACT
-from worker.deploy.model import OPSET
+from worker.deploy.model_file import OPSET
 
 LEAPP = "leapp.yaml"
 _VERSION = "1.3"

@@ -30,7 +30,7 @@ class Runnable(Protocol):
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordedObservations:
     """The observations of some worlds, step by step."""
 
     inputs: Mapping[str, np.ndarray]
@@ -49,22 +49,22 @@ class Recording:
         return int(self.begins[1:].sum())
 
 
-def single(inputs: Mapping[str, np.ndarray]) -> Recording:
+def single(inputs: Mapping[str, np.ndarray]) -> RecordedObservations:
     """Observations that have nothing to do with each other, by name of the input, shape (n, …): one step of n worlds."""
     count = len(next(iter(inputs.values())))
-    return Recording({name: each[None] for name, each in inputs.items()}, np.ones((1, count), dtype=bool))
+    return RecordedObservations({name: each[None] for name, each in inputs.items()}, np.ones((1, count), dtype=bool))
 
 
-def made_up(exported: ExportedPolicy) -> Recording:
+def made_up(exported: ExportedPolicy) -> RecordedObservations:
     """The policy's own sample, in another order in each step: numbers that no roll-out showed."""
     count = exported.sample.batch_size[0]
     steps = [exported.named(exported.sample[(torch.arange(count) + step) % count]) for step in range(STEPS)]
     begins = np.zeros((STEPS, count), dtype=bool)
     begins[0] = True
-    return Recording({name: np.stack([step[name].numpy() for step in steps]) for name in steps[0]}, begins)
+    return RecordedObservations({name: np.stack([step[name].numpy() for step in steps]) for name in steps[0]}, begins)
 
 
-def trained_actions(policy: Policy, recording: Recording, groups: Mapping[str, str]) -> np.ndarray:
+def trained_actions(policy: Policy, recording: RecordedObservations, groups: Mapping[str, str]) -> np.ndarray:
     """Actions of the trained policy, on the CPU; shape (steps, worlds, actions).
 
     Args:
@@ -82,7 +82,7 @@ def trained_actions(policy: Policy, recording: Recording, groups: Mapping[str, s
     return np.stack(actions)
 
 
-def exported_actions(policy: Runnable, recording: Recording) -> np.ndarray:
+def exported_actions(policy: Runnable, recording: RecordedObservations) -> np.ndarray:
     """Actions of the exported policy; shape (steps, worlds, actions)."""
     actions = []
     policy.reset()
@@ -98,7 +98,7 @@ def difference(found: np.ndarray, wanted: np.ndarray) -> float:
     return float((np.abs(found - wanted) / np.maximum(1.0, np.abs(wanted))).max())
 
 
-def compare(what: str, policy: Runnable, recording: Recording, wanted: np.ndarray) -> float:
+def compare(what: str, policy: Runnable, recording: RecordedObservations, wanted: np.ndarray) -> float:
     """The greatest difference of an exported policy to the trained one's actions. Raises TrainingError above the tolerance."""
     found = difference(exported_actions(policy, recording), wanted)
     if not found <= TOLERANCE:
@@ -109,12 +109,12 @@ def compare(what: str, policy: Runnable, recording: Recording, wanted: np.ndarra
 
 
 def refuse_hidden_memory(
-    policy: Policy, exported: ExportedPolicy, algorithm: str, recording: Recording, groups: Mapping[str, str]
+    policy: Policy, exported: ExportedPolicy, algorithm: str, recording: RecordedObservations, groups: Mapping[str, str]
 ) -> None:
     """Raise UserError where the policy acts otherwise after other observations, and its module has no recurrent state."""
     if exported.states:
         return
-    last = Recording({name: each[-1:] for name, each in recording.inputs.items()}, recording.begins[:1])
+    last = RecordedObservations({name: each[-1:] for name, each in recording.inputs.items()}, recording.begins[:1])
     fresh, after = trained_actions(policy, last, groups)[0], trained_actions(policy, recording, groups)[-1]
     if difference(fresh, after) > TOLERANCE:
         raise UserError(

@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from tensordict import TensorDict
 
-from worker.deploy.parity import Recording
+from worker.deploy.parity import RecordedObservations
 from worker.evaluation import episodes
 from worker.evaluation.episodes import Acting, Episodes
-from worker.learning.distributed import Gang, Placement
+from worker.learning.distributed import Gang, RankPlacement
 from worker.learning.setup import observed
 from worker.settings.errors import TrainingError
 
@@ -78,7 +78,7 @@ class _Watched:
         self._policy.reset(worlds)
 
 
-def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> Recording:
+def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> RecordedObservations:
     """Let ``policy`` act, and keep what it sees in the first worlds; all episodes begin anew at the start and in the middle.
 
     Args:
@@ -104,7 +104,7 @@ def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> Recording:
         policy.reset(task.dones)
         if step + 1 < steps:
             begins[step + 1] = task.dones[:worlds].cpu().numpy()
-    return Recording({name: np.stack(rows) for name, rows in kept.items()}, begins)
+    return RecordedObservations({name: np.stack(rows) for name, rows in kept.items()}, begins)
 
 
 def play(task: Task, policy: Acting, rounds: int, extremes: Extremes | None = None) -> Episodes:
@@ -116,7 +116,7 @@ def play(task: Task, policy: Acting, rounds: int, extremes: Extremes | None = No
         rounds: At least 1.
         extremes: Is shown every observation.
     """
-    alone = Gang(Placement(), task.device, None, ["here"])
+    alone = Gang(RankPlacement(), task.device, None, ["here"])
     return episodes.play([task] * rounds, _Watched(policy, extremes) if extremes else policy, alone)
 
 

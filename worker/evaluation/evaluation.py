@@ -39,7 +39,7 @@ FORMAT = 1
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluatedEpisodes:
     """The episodes of all ranks, and what they are of.
 
     Attributes:
@@ -213,7 +213,9 @@ class Watcher(Protocol):
         """
 
 
-def evaluate(task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episodes: int | None = None) -> Evaluation:
+def evaluate(
+    task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episodes: int | None = None
+) -> EvaluatedEpisodes:
     """Run at least ``episodes`` episodes, by default one a world; all ranks call it. The worlds are left as they were."""
     started = time.perf_counter()
     before = task.state_dict()
@@ -224,9 +226,9 @@ def evaluate(task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episode
     return result_of(task, played, checkpoint, None, started)
 
 
-def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, started: float) -> Evaluation:
+def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, started: float) -> EvaluatedEpisodes:
     """The evaluation that these episodes make; ``started`` by ``time.perf_counter``."""
-    return Evaluation(
+    return EvaluatedEpisodes(
         checkpoint=checkpoint,
         task=type(task).__name__,
         played=played,

@@ -10,7 +10,7 @@ from shared_store.contract.phases import Phase
 from shared_store.volume.files import write_atomic
 from worker.evaluation.evaluation import best_words, evaluate
 from worker.evaluation.reward_plot import plot_reward
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import WorldShare
 from worker.learning.hooks import Hook
 from worker.learning.randomness import held_out_seed
 from worker.learning.setup import build_task
@@ -74,7 +74,7 @@ def held_out_worlds(loop: Loop) -> Task:
     worlds, progress = loop.task, loop.state.progress
     if loop.config.randomize.draws_worlds:
         total = min(loop.share.total, EVALUATED * loop.gang.size)
-        share = Share.of(loop.gang.rank, loop.gang.size, total)
+        share = WorldShare.of(loop.gang.rank, loop.gang.size, total)
         seed = held_out_seed(loop.training.seed)
         worlds = build_task(type(loop.task), loop.config, share, loop.gang, seed, loop.beacon)
     last = max(0, progress.iteration - 1)

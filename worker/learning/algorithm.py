@@ -23,7 +23,7 @@ POLICY = "policy"
 
 
 @dataclass(frozen=True)
-class Share:
+class WorldShare:
     """The worlds of a rank: ``[first, first + count)`` of ``total``, by global index."""
 
     first: int
@@ -31,7 +31,7 @@ class Share:
     total: int
 
     @classmethod
-    def of(cls, rank: int, ranks: int, total: int) -> Share:
+    def of(cls, rank: int, ranks: int, total: int) -> WorldShare:
         """Rank r of R holds worlds ``[r·T // R, (r + 1)·T // R)`` of T."""
         first = rank * total // ranks
         return cls(first, (rank + 1) * total // ranks - first, total)
@@ -58,11 +58,11 @@ class Spaces:
 
 
 @dataclass(frozen=True)
-class Setting:
+class LearningSetting:
     """The setting in which an algorithm learns."""
 
     spaces: Spaces
-    share: Share
+    share: WorldShare
     """The worlds of this rank, and of all."""
     gang: Gang
     """The ranks that learn together; all tensors are on its ``device``."""
@@ -164,7 +164,7 @@ class Algorithm(Protocol):
     graphs: Sequence[CudaGraphFunction]
     """The graphs that :meth:`learn` replays, for the run's log; the loop releases them at the end."""
 
-    def __init__(self, config: Any, setting: Setting) -> None:
+    def __init__(self, config: Any, setting: LearningSetting) -> None:
         """Allocate all buffers once. Raises ValueError for an unsupported setting, in one line with its name."""
 
     def begin(self, iteration: int) -> None:

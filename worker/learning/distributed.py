@@ -34,7 +34,7 @@ BUILD_SECONDS = 1800.0
 
 
 @dataclass(frozen=True)
-class Placement:
+class RankPlacement:
     """This process's place in its gang (torchrun's variables)."""
 
     rank: int = 0
@@ -49,7 +49,7 @@ class Placement:
     """Whether a launcher (torchrun) keeps the TCP store already, at the master's address and port."""
 
     @classmethod
-    def from_env(cls, env: Mapping[str, str]) -> Placement:
+    def from_env(cls, env: Mapping[str, str]) -> RankPlacement:
         """Read ``RANK``, ``WORLD_SIZE`` and their kin. Raises ValueError naming one that is malformed."""
 
         def integer(name: str, default: int) -> int:
@@ -89,7 +89,7 @@ class Placement:
 class Gang:
     """The ranks of one attempt, connected. Collectives work in place and are no-ops in a gang of one."""
 
-    def __init__(self, placement: Placement, device: str, store: dist.Store | None, sites: list[str]) -> None:
+    def __init__(self, placement: RankPlacement, device: str, store: dist.Store | None, sites: list[str]) -> None:
         self.placement, self.device, self.store = placement, device, store
         self.rank, self.size, self.is_main = placement.rank, placement.world_size, placement.rank == 0
         self._sites = sites
@@ -189,7 +189,7 @@ def require_gpus(visible: str, local_rank: int) -> None:
         )
 
 
-def connect(placement: Placement, *, device: str | None = None, report_seconds: float = REPORT_SECONDS) -> Gang:
+def connect(placement: RankPlacement, *, device: str | None = None, report_seconds: float = REPORT_SECONDS) -> Gang:
     """Form the gang: report, process group, one all-reduce. Every rank calls it.
 
     Raises:
@@ -228,7 +228,7 @@ def connect(placement: Placement, *, device: str | None = None, report_seconds: 
     return Gang(placement, device, store, sites)
 
 
-def _open_store(placement: Placement, seconds: float) -> dist.TCPStore:
+def _open_store(placement: RankPlacement, seconds: float) -> dist.TCPStore:
     """The main rank's TCP store, listening on the main node's address alone; or the one that is there."""
     address, port = placement.master_address, placement.master_port
     if placement.rank == 0 and not placement.has_store:
@@ -266,7 +266,7 @@ def _listen(address: str, port: int) -> int:
     return listener.detach()
 
 
-def _report(placement: Placement, store: dist.Store, seconds: float) -> list[str]:
+def _report(placement: RankPlacement, store: dist.Store, seconds: float) -> list[str]:
     """Every rank says that it is there; returns each rank's (host, kernel cache)."""
     site = f"{socket.gethostname()}:{os.environ.get('WARP_CACHE_PATH', '')}"
     store.set(f"here/{placement.rank}", site)
@@ -300,7 +300,7 @@ def _await_reports(count: int, store: dist.Store, seconds: float) -> list[int]:
     return missing
 
 
-def _missing(placement: Placement, missing: list[int], seconds: float) -> str:
+def _missing(placement: RankPlacement, missing: list[int], seconds: float) -> str:
     names = ", ".join(placement.describe(rank) for rank in missing)
     return (
         f"{names} did not report within {seconds:g} s: {placement.world_size - len(missing)} of {placement.world_size} ranks are here. "

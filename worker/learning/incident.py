@@ -15,14 +15,14 @@ from shared_store.volume.files import write_atomic
 from worker.tasks.run.policy_contract import robots_of
 
 if TYPE_CHECKING:
-    from worker.learning.algorithm import Share
+    from worker.learning.algorithm import WorldShare
     from worker.tasks.run.task import Task
 
 
 class Incident:
     """Keeps the data for :meth:`write` on the device. Costs one copy of the worlds' state per iteration, in the rollout's own graph."""
 
-    def __init__(self, task: Task, share: Share, steps: int, section: dict[str, Any], seed: int) -> None:
+    def __init__(self, task: Task, share: WorldShare, steps: int, section: dict[str, Any], seed: int) -> None:
         self._share, self._section, self._seed = share, section, seed
         self._live, self._robots = task.state_tensors(), robots_of(task)
         self._kept = {name: tensor.clone() for name, tensor in self._live.items()}

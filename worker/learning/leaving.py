@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 
 from shared_store.contract.error_text import counted
 from shared_store.volume.checkpoints import list_checkpoints
-from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.node_outcomes import EX_TEMPFAIL
 
 if TYPE_CHECKING:
     from worker.learning.job import StopRequest

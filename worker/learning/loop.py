@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase
 from shared_store.volume.checkpoints import Checkpoint
-from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.node_outcomes import EX_TEMPFAIL
 from worker.learning.adoption import adopt
-from worker.learning.algorithm import Algorithm, Share
+from worker.learning.algorithm import Algorithm, WorldShare
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
 from worker.learning.beacon import Beacon
 from worker.learning.cadence import Cadence
@@ -22,7 +22,7 @@ from worker.learning.distributed import Gang
 from worker.learning.earlier_settings import as_begun
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.failures import Failures
-from worker.learning.faults import die, kill_at
+from worker.learning.fault_injection import die, kill_at
 from worker.learning.hooks import Hook
 from worker.learning.incident import Incident
 from worker.learning.job import StopRequest, end_startup, user_errors
@@ -69,7 +69,7 @@ class Loop:
         job = training.job
         self.training, self.job, self.config, self.gang, self.stop = training, job, training.config, gang, stop
         self._hooks = hooks
-        self.share = Share.of(gang.rank, gang.size, total_worlds(job, gang))
+        self.share = WorldShare.of(gang.rank, gang.size, total_worlds(job, gang))
         self._kill_at = kill_at(os.environ, job) if gang.is_main else None
         self.cadence = Cadence(training.save_every)
         self._save_is_due = self._order_is_due = self._is_scheduled = False
@@ -297,7 +297,7 @@ class Loop:
         total, iteration = self.share.total, self.state.progress.iteration
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
-        world += Share.of(rank, self.gang.size, total).first
+        world += WorldShare.of(rank, self.gang.size, total).first
         said = f"{counted(resets, 'reset')} of worlds, among them world {world}: {cause}"
         if resets <= math.ceil(self.config.nan_limit * total):
             self._warnings += 1

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Normal, kl_divergence
 
-from worker.learning.algorithm import POLICY, ExportedPolicy, Setting, Spaces, Transition
+from worker.learning.algorithm import POLICY, ExportedPolicy, LearningSetting, Spaces, Transition
 from worker.learning.ppo import draws
 from worker.learning.ppo.draws import Draws
 from worker.settings.ppo import PPOConfig
@@ -51,7 +51,7 @@ class Network(nn.Module):
         return outputs
 
     @torch.no_grad()
-    def update_normalizer(self, observations: torch.Tensor, setting: Setting) -> None:
+    def update_normalizer(self, observations: torch.Tensor, setting: LearningSetting) -> None:
         """Merge mean and variance of an iteration's observations, shape (N, inputs), of all ranks, into those of all before."""
         new, gang = observations.double(), setting.gang
         count = len(new) // setting.share.count * setting.share.total
@@ -63,7 +63,7 @@ class Network(nn.Module):
         self.mean.add_(part * apart)
 
 
-class Actor(Network):
+class GaussianActor(Network):
     """The policy: the network's output is the mean of the actions; the standard deviation of each action is also learnt."""
 
     def __init__(self, spaces: Spaces, config: PPOConfig) -> None:
@@ -97,7 +97,7 @@ class PlainPPO:
     kernels: ClassVar[Sequence[Any]] = (draws,)
     graphs: Sequence[Any] = ()
 
-    def __init__(self, config: PPOConfig, setting: Setting) -> None:
+    def __init__(self, config: PPOConfig, setting: LearningSetting) -> None:
         group, groups = config.critic_observations, setting.spaces.observations
         if group not in groups or len(groups[group]) != 1:
             raise ValueError(f"critic_observations: the task has no numbers {group!r}; see algorithm ppo")
@@ -107,7 +107,7 @@ class PlainPPO:
             raise ValueError(f"optimizer: plain PPO has adam alone; algorithm ppo has {config.optimizer}")
         self.config, self.setting, self.gang, self.steps = config, setting, setting.gang, config.steps
         device, self.rate = setting.gang.device, config.learning_rate
-        self.actor = Actor(setting.spaces, config)
+        self.actor = GaussianActor(setting.spaces, config)
         self.critic = Network(groups[group][0], config.critic_hidden_sizes or config.hidden_sizes, 1, config)
         self.parameters = [*self.actor.to(device).parameters(), *self.critic.to(device).parameters()]
         for parameter in self.parameters:
@@ -259,7 +259,7 @@ class PlainPPO:
             return max(self.rate / 1.5, least)
         return min(self.rate * 1.5, greatest) if 0.0 < kl < desired / 2.0 else self.rate
 
-    def policy(self) -> Actor:
+    def policy(self) -> GaussianActor:
         """The actor is the policy."""
         return self.actor
 
@@ -292,6 +292,6 @@ class PlainPPO:
         """This algorithm keeps no state per world."""
 
     @classmethod
-    def build_policy(cls, config: PPOConfig, spaces: Spaces, device: str) -> Actor:
+    def build_policy(cls, config: PPOConfig, spaces: Spaces, device: str) -> GaussianActor:
         """The actor alone."""
-        return Actor(spaces, config).to(device).eval()
+        return GaussianActor(spaces, config).to(device).eval()

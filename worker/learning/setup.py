@@ -18,7 +18,7 @@ from shared_store.contract.policy_changes import brief, differences, robot_chang
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.epoch import check_epoch
 from shared_store.volume.files import read_json, write_json
-from worker.learning.algorithm import Algorithm, ExportedPolicy, Setting, Share, Spaces, Transition
+from worker.learning.algorithm import Algorithm, ExportedPolicy, LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.algorithms import refuse_incomplete
 from worker.learning.beacon import Beacon
 from worker.learning.distributed import Gang, warm_marker
@@ -32,12 +32,12 @@ from worker.tasks.run.policy_contract import policy_contract, readings_of, robot
 if TYPE_CHECKING:
     from worker.learning.training import Training
     from worker.settings.task import TaskConfig
-    from worker.simulation.robot_comparison import Difference
+    from worker.simulation.robot_comparison import RobotDifference
     from worker.tasks.run.task import Task
 
 
 def build_task(
-    task_type: type[Task], config: TaskConfig, share: Share, gang: Gang, seed: int, beacon: Beacon | None = None
+    task_type: type[Task], config: TaskConfig, share: WorldShare, gang: Gang, seed: int, beacon: Beacon | None = None
 ) -> Task:
     """This rank's worlds; kernels are compiled once per cache. Raises UserError for refused settings and for mistakes in the user's own code.
 
@@ -83,7 +83,7 @@ def spaces_of(task: Task) -> Spaces:
 
 
 def action_ranges(task: Task) -> tuple[tuple[float, float] | None, ...]:
-    """See :attr:`Setting.action_ranges`."""
+    """See :attr:`LearningSetting.action_ranges`."""
     interface = None if task.discrete else task.interface()
     return tuple(action.clip for action in interface.actions) if interface else ()
 
@@ -98,7 +98,7 @@ def build_algorithm(
     algorithm: type[Algorithm],
     settings: Any,
     task: Task,
-    share: Share,
+    share: WorldShare,
     gang: Gang,
     seed: int,
     *,
@@ -108,11 +108,11 @@ def build_algorithm(
     call it.
 
     Args:
-        rehearsal: See :attr:`Setting.rehearsal`.
+        rehearsal: See :attr:`LearningSetting.rehearsal`.
     """
     load_kernels(algorithm, gang)
     control_seconds = 1.0 / task.config.control_hz
-    setting = Setting(spaces_of(task), share, gang, seed, control_seconds, action_ranges(task), rehearsal)
+    setting = LearningSetting(spaces_of(task), share, gang, seed, control_seconds, action_ranges(task), rehearsal)
     with user_errors("train"):
         built = algorithm(settings, setting)
     refuse_incomplete(built, algorithm.__name__, ("steps", "graphs"))
@@ -234,7 +234,7 @@ def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) ->
     return what
 
 
-def _before(found: Sequence[Difference]) -> str:
+def _before(found: Sequence[RobotDifference]) -> str:
     first, more = found[0], len(found) - 1
     was, is_now = shown_value(first.built), shown_value(first.file)
     return f"{first.element}: {first.field} was {was}, is {is_now}" + (f" ({more} more)" if more else "")

@@ -28,7 +28,7 @@ from shared_store.volume.checkpoints import (
 )
 from shared_store.volume.epoch import check_epoch
 from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
-from worker.learning.algorithm import Algorithm, Share
+from worker.learning.algorithm import Algorithm, WorldShare
 from worker.learning.algorithms import section_of
 from worker.learning.distributed import Gang
 from worker.learning.job import Job
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from worker.tasks.run.task import Task
 
 
-class Ended(NamedTuple):
+class EndedEpisodes(NamedTuple):
     """Episodes that ended in one iteration, over all ranks."""
 
     steps: float
@@ -87,7 +87,7 @@ class Progress:
     score_episodes: int = 0
     """Number of episodes in the score."""
     recent: list[list[float]] = field(default_factory=list)
-    """The newest iterations, as many as the score needs: the fields of :class:`Ended`, as lists for checkpoints."""
+    """The newest iterations, as many as the score needs: the fields of :class:`EndedEpisodes`, as lists for checkpoints."""
 
     def saved(self) -> dict[str, Any]:
         """All fields, for a thread that writes them while training continues: the entries of ``recent`` never change, only the list
@@ -108,10 +108,10 @@ class Progress:
             worlds: Number of worlds of all ranks.
             longest: Steps of the longest episode.
         """
-        self.recent.append(list(Ended(steps, episodes, returns, squares)))
+        self.recent.append(list(EndedEpisodes(steps, episodes, returns, squares)))
         span = ended = total = spread = 0.0
         for index in reversed(range(len(self.recent))):
-            entry = Ended(*self.recent[index])
+            entry = EndedEpisodes(*self.recent[index])
             span, ended = span + entry.steps, ended + entry.episodes
             total, spread = total + entry.returns, spread + entry.squares
             if span >= longest and ended >= max(EPISODES, worlds):
@@ -133,7 +133,7 @@ class TrainingState:
         self,
         job: Job,
         gang: Gang,
-        share: Share,
+        share: WorldShare,
         task: Task,
         algorithm: Algorithm,
         facts: dict[str, Any],
@@ -228,7 +228,7 @@ class TrainingState:
         return self.saver.committed
 
     def _manifest(self) -> dict[str, Any]:
-        shares = [Share.of(rank, self.gang.size, self.share.total) for rank in range(self.gang.size)]
+        shares = [WorldShare.of(rank, self.gang.size, self.share.total) for rank in range(self.gang.size)]
         return {
             **self.facts,
             "world_size": self.gang.size,

@@ -23,7 +23,7 @@ from shared_store.contract.node import ContractError, NodeContract, job_variable
 from shared_store.volume.epoch import Claim, StaleEpoch, raise_epoch, read_claim, read_epoch
 from shared_store.volume.layout import Run, Store, StoreError
 from shared_store.volume.logs import OUTCOME_LINE, format_line, format_lines
-from shared_store.volume.outcomes import EX_TEMPFAIL, Outcome
+from shared_store.volume.node_outcomes import EX_TEMPFAIL, Outcome
 from worker.node import supervisor
 from worker.node.lifeline import ChildEnd, Loss, MainEnd
 

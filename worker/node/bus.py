@@ -40,7 +40,7 @@ _PUSHED_A_SECOND = 2 << 20
 """Bytes of its log that a node pushes in one second; of more, those who follow it read the file."""
 
 
-class Command:
+class BusCommand:
     """A command from the controller that waits for its answer: ``checkpoint``, ``stacks`` or ``stop``."""
 
     def __init__(self, query: Any, credential: Credential, key: str, number: str) -> None:
@@ -65,7 +65,7 @@ class NodeBus:
     def __init__(self, contract: NodeContract, wakeup: int) -> None:
         """``wakeup``: descriptor that is written to when a command arrives."""
         self.contract, self._wakeup = contract, wakeup
-        self.commands: queue.SimpleQueue[Command] = queue.SimpleQueue()
+        self.commands: queue.SimpleQueue[BusCommand] = queue.SimpleQueue()
         self._node = contract.job, contract.attempt, contract.node_index
         self._prefix = prefix(*self._node)
         self._credential = Credential.parse(contract.bus_token or "")
@@ -183,7 +183,7 @@ class NodeBus:
             query.drop()
             return
         self._heard.add(number)
-        self.commands.put(Command(query, self._credential, key, number))
+        self.commands.put(BusCommand(query, self._credential, key, number))
         try:
             os.write(self._wakeup, b"c")
         except OSError:

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from shared_store.contract.node import NodeContract
-from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.node_outcomes import EX_TEMPFAIL
 
 PORT = 29499
 """Port of the main node, one below torch.distributed's."""

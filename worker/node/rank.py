@@ -17,7 +17,7 @@ from shared_store.contract.faults import fault_from, fault_in
 from shared_store.contract.node import NodeContract
 from shared_store.process.tether import tied
 from shared_store.volume.files import DamagedFile, json_object, read_json
-from shared_store.volume.outcomes import FirstError
+from shared_store.volume.node_outcomes import FirstError
 
 _LONGEST_LINE = 65536
 """Bytes after which a line without an end is cut, so that a program that never prints a newline can't fill the memory."""

@@ -29,12 +29,12 @@ from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run, Store, StoreError
 from shared_store.volume.log_files import LogWriter, left_out
 from shared_store.volume.logs import END_LINE, format_line, format_lines
-from shared_store.volume.outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
-from worker.node.bus import Command, NodeBus
+from shared_store.volume.node_outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
+from worker.node.bus import BusCommand, NodeBus
 from worker.node.memory import MemoryLimit
 from worker.node.network import interface_of
-from worker.node.processes import adopt_orphans, kill_group
 from worker.node.rank import Rank
+from worker.node.rank_processes import adopt_orphans, kill_group
 from worker.node.stacks import dump_stacks, state_of
 from worker.node.surroundings import Surroundings
 
@@ -78,7 +78,7 @@ class Supervisor:
         self.deadline: float | None = None
         self.stopping: str | None = None
         self._next_fence = 0.0
-        self._saving: list[tuple[int, Command]] = []
+        self._saving: list[tuple[int, BusCommand]] = []
         self._log = LogWriter(run.log(contract.job, contract.attempt, contract.node_index), contract.log_limit)
         self._lost = (0, 0, "")
         """Lines and bytes that the log could not take since the last one that it could, and why."""
@@ -239,7 +239,7 @@ class Supervisor:
             else:
                 command.reply(f"unknown command {command.name}")
 
-    def _order_save(self, command: Command) -> None:
+    def _order_save(self, command: BusCommand) -> None:
         """Ask the ranks to save now (SIGUSR2); the answer follows when the first save after that is durable."""
         rank = self.ranks[0]
         if rank.running and rank.heard is None and self.contract.stall_timeout is not None:  # which only a training has

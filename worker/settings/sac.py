@@ -45,7 +45,7 @@ class SACConfig:
     """Number of newest steps kept of every world, at least ``steps`` and ``n_step``.
 
     A step of a world costs ``4 · (2 · observations + actions + 3)`` bytes of the device's memory; if the critics have their own group,
-    its observations count too. :mod:`worker.learning.sac.replay` says what is stored."""
+    its observations count too. :mod:`worker.learning.sac.replay_buffer` says what is stored."""
     warm_up: Annotated[int, Field(ge=0)] = 8
     """Steps of every world that the replay must hold before learning starts; until the first update, actions are drawn uniformly within
     the limit."""

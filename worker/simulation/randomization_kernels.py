@@ -56,7 +56,7 @@ class Entries:
 
 
 @wp.struct
-class Changes:
+class ModelChanges:
     """The changes that draws make to numbers of the model. Changes ``starts[i]`` to ``starts[i + 1]`` apply to number ``i``, in order.
 
     Attributes:
@@ -192,7 +192,7 @@ def _combined(operation: int, value: float, number: float) -> float:
 @wp.kernel
 def change_numbers(
     changed: wp.array[wp.bool],
-    changes: Changes,
+    changes: ModelChanges,
     draws: wp.array2d[wp.float32],
     defaults: wp.array2d[wp.float32],
     values: wp.array2d[wp.float32],
@@ -236,7 +236,7 @@ def _principal_frame(axes: wp.mat33) -> wp.quat:
 @wp.kernel
 def change_bodies(
     changed: wp.array[wp.bool],
-    changes: Changes,
+    changes: ModelChanges,
     draws: wp.array2d[wp.float32],
     defaults: Bodies,
     values: Bodies,

@@ -60,14 +60,14 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Target:
+class EntryTargets:
     """Targets of one entry: ``names`` of its parts, and ``changes`` in the same order."""
 
     names: tuple[str, ...]
     changes: tuple[Change, ...]
 
 
-def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]) -> Target:
+def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]) -> EntryTargets:
     """Look up the targets of an entry.
 
     Args:
@@ -83,7 +83,7 @@ def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]
         changes = (
             Change(array, column, 0, index) for array in ("opt.gravity", "gravity") for index, column in enumerate(axes)
         )
-        return Target(("gravity",), tuple(changes))
+        return EntryTargets(("gravity",), tuple(changes))
     if entry.robot is None:
         shapes = [label for label in worlds.model.shape_label]
         one_world = _shapes_of_a_world(worlds)
@@ -150,7 +150,7 @@ def body_column(worlds: Worlds, body: int) -> int:
     return _columns(worlds.solver.mjc_body_to_newton.numpy()[0])[body]
 
 
-def _bodies(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> Target:
+def _bodies(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> EntryTargets:
     masses = worlds.model.body_mass.numpy()
     axes = [entry.quantity.axes.index(axis) for axis in entry.drawn_axes] or [-1]
     for index in chosen:
@@ -162,10 +162,10 @@ def _bodies(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]
         for element, index in enumerate(chosen)
         for number, axis in enumerate(axes)
     )
-    return Target(tuple(view.body_names[index] for index in chosen), tuple(changes))
+    return EntryTargets(tuple(view.body_names[index] for index in chosen), tuple(changes))
 
 
-def _geoms(entry: Randomize, worlds: Worlds, names: list[str], shapes: list[int]) -> Target:
+def _geoms(entry: Randomize, worlds: Worlds, names: list[str], shapes: list[int]) -> EntryTargets:
     columns = _columns(worlds.solver.mjc_geom_to_newton_shape.numpy()[0])
     axes = [entry.quantity.axes.index(axis) for axis in entry.drawn_axes]
     there = [(name, columns[shape]) for name, shape in zip(names, shapes, strict=True) if shape in columns]
@@ -176,13 +176,15 @@ def _geoms(entry: Randomize, worlds: Worlds, names: list[str], shapes: list[int]
         for element, (_, geom) in enumerate(there)
         for number, axis in enumerate(axes)
     )
-    return Target(tuple(name for name, _ in there), tuple(changes))
+    return EntryTargets(tuple(name for name, _ in there), tuple(changes))
 
 
-def _joints(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> Target:
+def _joints(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> EntryTargets:
     names = tuple(view.joint_names[joint] for joint in chosen)
     if entry.what == "encoder_bias":
-        return Target(names, tuple(Change(f"bias {view.name}", joint, index) for index, joint in enumerate(chosen)))
+        return EntryTargets(
+            names, tuple(Change(f"bias {view.name}", joint, index) for index, joint in enumerate(chosen))
+        )
     solver, model = worlds.solver, worlds.solver.mj_model
     dofs = _columns(solver.mjc_dof_to_newton_dof.numpy()[0])
     changes = []
@@ -197,10 +199,10 @@ def _joints(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]
         for number, axis in enumerate(entry.drawn_axes):
             side = entry.quantity.axes.index(axis)
             changes.append(Change("jnt_range", 2 * column + side, element, number))
-    return Target(names, tuple(changes))
+    return EntryTargets(names, tuple(changes))
 
 
-def _actuators(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> Target:
+def _actuators(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> EntryTargets:
     sources = worlds.solver.mjc_actuator_to_newton_idx
     columns = {int(source): column for column, source in enumerate([] if sources is None else sources.numpy())}
     names = tuple(view.joint_names[joint] for joint in chosen)
@@ -217,7 +219,7 @@ def _actuators(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[i
             not own or entry.what == "effort_limit"
         ):  # the force of such a motor is limited both when it is computed and when it acts
             changes += _of_actuator(entry.what, worlds, columns[source], element, where)
-    return Target(names, tuple(changes))
+    return EntryTargets(names, tuple(changes))
 
 
 def _of_explicit_motor(what: str, worlds: Worlds, source: int, element: int) -> list[Change]:

@@ -21,14 +21,14 @@ from worker.simulation.randomization_kernels import (
     STARTUP,
     Bodies,
     BodyFields,
-    Changes,
     Entries,
+    ModelChanges,
     change_bodies,
     change_numbers,
     draw_at_start,
     draw_due,
 )
-from worker.simulation.randomization_targets import Change, Target, body_column, find_target
+from worker.simulation.randomization_targets import Change, EntryTargets, body_column, find_target
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
@@ -155,7 +155,7 @@ class Randomizations:
                 found[f"{name}.seconds"] = seconds[index]
         return found
 
-    def _list_entries(self, targets: Mapping[str, Target], control_hz: float) -> None:
+    def _list_entries(self, targets: Mapping[str, EntryTargets], control_hz: float) -> None:
         """Give every drawn number a column, and every entry its row in the tables."""
         self.names: list[str] = []
         self._first_columns: list[int] = []
@@ -185,7 +185,7 @@ class Randomizations:
         table.seconds = _pairs([entry.seconds or (0.0, 0.0) for entry in every], self._device)
         table.control_hz = control_hz
 
-    def _group(self, targets: Mapping[str, Target], robots: Mapping[str, RobotArrays]) -> None:
+    def _group(self, targets: Mapping[str, EntryTargets], robots: Mapping[str, RobotArrays]) -> None:
         """Gather the changes of each array, in the order of the entries."""
         grouped: dict[str, list[_Drawn]] = {}
         for (name, entry), first in zip(self._entries.items(), self._first_columns, strict=True):
@@ -280,7 +280,7 @@ def _pairs(values: Iterable[tuple[float, float]], device: wp.Device | None) -> w
     return wp.array(np.array(list(values), np.float32).reshape(-1, 2), dtype=wp.vec2, device=device)
 
 
-def _table(drawn: list[_Drawn], device: wp.Device | None) -> tuple[Changes, list[int]]:
+def _table(drawn: list[_Drawn], device: wp.Device | None) -> tuple[ModelChanges, list[int]]:
     """The changes in the layout of a kernel, and the changed columns, ascending."""
     columns = sorted({each.change.column for each in drawn})
     of_column: dict[int, list[_Drawn]] = {column: [] for column in columns}
@@ -288,7 +288,7 @@ def _table(drawn: list[_Drawn], device: wp.Device | None) -> tuple[Changes, list
         of_column[each.change.column].append(each)
     ordered = [each for column in columns for each in of_column[column]]
     starts = np.cumsum([0, *(len(of_column[column]) for column in columns)])
-    table = Changes()
+    table = ModelChanges()
     for name, dtype, values in (
         ("columns", wp.int32, columns),
         ("least", wp.float32, [max(each.change.least for each in of_column[column]) for column in columns]),

@@ -115,7 +115,7 @@ class Robot:
         Raises:
             ValueError: See :meth:`add_to`.
         """
-        source = robot_reading.Source(
+        source = robot_reading.ReadingOptions(
             self.file,
             self.fixed,
             self.ignore,

@@ -71,7 +71,7 @@ SHARED = ("damping", "dampingpoly", "armature")
 
 
 @dataclass(frozen=True)
-class Difference:
+class RobotDifference:
     """One value that the built robot has otherwise than its file.
 
     Attributes:
@@ -113,11 +113,11 @@ class Comparison:
         accepted: Differences that do not count.
     """
 
-    differences: tuple[Difference, ...]
+    differences: tuple[RobotDifference, ...]
     notes: tuple[str, ...]
     bodies: dict[int, int]
     sliders: tuple[int, ...] = ()
-    accepted: tuple[Difference, ...] = ()
+    accepted: tuple[RobotDifference, ...] = ()
 
 
 def compare(
@@ -135,34 +135,36 @@ def compare(
         twins = Twins(reference, builder)
         found = [difference for check in CHECKS for difference in check(twins)]
         found += _options(twins) if options else ()
-        found = found or [Difference(*each) for each in dynamics(twins, options)]
+        found = found or [RobotDifference(*each) for each in dynamics(twins, options)]
         counting = [each for each in found if not matches(each, accept)]
         accepted = tuple(each for each in found if matches(each, accept))
         bodies = {body: twins.body_indices[twin] for body, twin in twins.bodies.items() if body}
         return Comparison(tuple(counting), tuple(notes(twins)), bodies, tuple(twins.sliders), accepted)
 
 
-def matches(difference: Difference, patterns: Sequence[str]) -> bool:
+def matches(difference: RobotDifference, patterns: Sequence[str]) -> bool:
     return any(fnmatchcase(f"{difference.element}: {difference.field}", pattern) for pattern in patterns)
 
 
-def _counts(twins: Twins) -> Iterator[Difference]:
+def _counts(twins: Twins) -> Iterator[RobotDifference]:
     kinds = {"body": twins.bodies, "joint": twins.joints, "tendon": twins.tendons, "equality": twins.equalities}
     for kind, pairs in kinds.items():
         for index in range(count_of(twins.file, kind)):
             if index not in pairs:
-                yield Difference(twins.name(kind, index), "existence", "missing", "there")
+                yield RobotDifference(twins.name(kind, index), "existence", "missing", "there")
     for what, field in COUNTS.items():
         if getattr(twins.built, field) != getattr(twins.file, field):
-            yield Difference("model", f"the number of {what}", getattr(twins.built, field), getattr(twins.file, field))
+            yield RobotDifference(
+                "model", f"the number of {what}", getattr(twins.built, field), getattr(twins.file, field)
+            )
     for flex in range(twins.file.nflex):
-        yield Difference(twins.name("flex", flex), "flexible body", "missing", "there")
+        yield RobotDifference(twins.name("flex", flex), "flexible body", "missing", "there")
     for kind in ("body", "geom", "actuator"):  # what else has plugins is not read
         for index in (getattr(twins.file, f"{kind}_plugin") >= 0).nonzero()[0]:
-            yield Difference(twins.name(kind, index), "plugin", "missing", "there")
+            yield RobotDifference(twins.name(kind, index), "plugin", "missing", "there")
 
 
-def _bodies(twins: Twins) -> Iterator[Difference]:
+def _bodies(twins: Twins) -> Iterator[RobotDifference]:
     file, built, size = twins.file, twins.stepped, length(twins.file)
     for body, twin in twins.bodies.items():
         if not body:
@@ -170,7 +172,7 @@ def _bodies(twins: Twins) -> Iterator[Difference]:
         element, root = twins.name("body", body), (twins.carriers_of(twin) or [twin])[-1]
         parent, above = int(file.body_parentid[body]), int(built.body_parentid[root])
         if twins.bodies.get(parent) != above:
-            yield Difference(element, "parent", twins.built_body(above), twins.name("body", parent))
+            yield RobotDifference(element, "parent", twins.built_body(above), twins.name("body", parent))
         yield from _fields(twins, "body", body, twin, "mass gravcomp")
         if file.body_mass[body]:
             yield from _unequal(element, "inertia", inertia(built, twin), inertia(file, body), 1e-15)
@@ -179,14 +181,14 @@ def _bodies(twins: Twins) -> Iterator[Difference]:
         yield from _unequal(element, "orientation", matrix(built.body_quat[root]), matrix(file.body_quat[body]), 1.0)
 
 
-def _joints(twins: Twins) -> Iterator[Difference]:
+def _joints(twins: Twins) -> Iterator[RobotDifference]:
     file, built = twins.file, twins.stepped
     shares = {name: from_actuators(file, name)[0] for name in SHARED}
     for joint, twin in twins.joints.items():
         element = twins.name("joint", joint)
         kind, other = (word_of(mujoco.mjtJoint, model.jnt_type[each]) for model, each in ((file, joint), (built, twin)))
         if kind != other:
-            yield Difference(element, "type", other, kind)
+            yield RobotDifference(element, "type", other, kind)
             continue
         if kind != "free":
             yield from _unequal(element, "pos", built.jnt_pos[twin], file.jnt_pos[joint], length(file))
@@ -208,19 +210,19 @@ def _joints(twins: Twins) -> Iterator[Difference]:
                 yield from _unequal(element, word, mine[second : second + count], theirs[first : first + count])
 
 
-def _geoms(twins: Twins) -> Iterator[Difference]:
+def _geoms(twins: Twins) -> Iterator[RobotDifference]:
     file, built = twins.file, twins.stepped
     has_medium = bool(file.opt.density or file.opt.viscosity)
     for geom in set(range(file.ngeom)) - set(twins.geoms):
         if has_mask(file, geom):
-            yield Difference(twins.name("geom", geom), "existence", "missing", "there")
+            yield RobotDifference(twins.name("geom", geom), "existence", "missing", "there")
         if has_medium:
             yield from _unequal(twins.name("geom", geom), "fluid", 0.0 * file.geom_fluid[geom], file.geom_fluid[geom])
     for geom, twin in twins.geoms.items():
         element = twins.name("geom", geom)
         kind, other = (word_of(mujoco.mjtGeom, model.geom_type[each]) for model, each in ((file, geom), (built, twin)))
         if kind != other:
-            yield Difference(element, "type", other, kind)
+            yield RobotDifference(element, "type", other, kind)
             continue
         if has_mask(file, geom):
             yield from _fields(twins, "geom", geom, twin, "condim friction solref solimp solmix priority gap")
@@ -231,23 +233,23 @@ def _geoms(twins: Twins) -> Iterator[Difference]:
         yield from _unequal(element, "shape and place", extent(built, twin), extent(file, geom), length(file))
 
 
-def _sites(twins: Twins) -> Iterator[Difference]:
+def _sites(twins: Twins) -> Iterator[RobotDifference]:
     file = twins.file
     for site, shape in twins.sites.items():
         element = twins.name("site", site)
         if shape is None:
-            yield Difference(element, "existence", "missing", "there")
+            yield RobotDifference(element, "existence", "missing", "there")
             continue
         position, turn = twins.built_site(shape)
         yield from _unequal(element, "pos", position, file.site_pos[site], length(file))
         yield from _unequal(element, "orientation", matrix(turn), matrix(file.site_quat[site]), 1.0)
 
 
-def _pairs(twins: Twins) -> Iterator[Difference]:
+def _pairs(twins: Twins) -> Iterator[RobotDifference]:
     for pair in range(twins.file.npair):
         element = f"contact pair {pair}"
         if pair not in twins.contact_pairs:
-            yield Difference(element, "existence", "missing", "there")
+            yield RobotDifference(element, "existence", "missing", "there")
             continue
         twin = twins.contact_pairs[pair]
         models = (twins.stepped, twin), (twins.file, pair)
@@ -265,15 +267,15 @@ def _of_friction(model: Any, pair: int) -> Any:
     return found if found.any() else model.pair_solref[pair]
 
 
-def _contacts(twins: Twins) -> Iterator[Difference]:
+def _contacts(twins: Twins) -> Iterator[RobotDifference]:
     words = {True: "can touch", False: "can't touch"}
     for pair, mine in differing(twins):
         if mine or not stay_apart(twins, pair):
             names = " and ".join(twins.name("geom", geom).removeprefix("geom ") for geom in pair)
-            yield Difference(f"geoms {names}", "contact", words[mine], words[not mine])
+            yield RobotDifference(f"geoms {names}", "contact", words[mine], words[not mine])
 
 
-def _tendons(twins: Twins) -> Iterator[Difference]:
+def _tendons(twins: Twins) -> Iterator[RobotDifference]:
     shares = {name: from_actuators(twins.file, name)[1] for name in SHARED}
     for tendon, twin in twins.tendons.items():
         yield from _fields(twins, "tendon", tendon, twin, TENDON)
@@ -289,14 +291,14 @@ def _tendons(twins: Twins) -> Iterator[Difference]:
         yield from _unequal(element, "coefficients", mine, theirs)
 
 
-def _ends(twins: Twins, element: str, words: Sequence[str], here: Ends, there: Ends) -> Iterator[Difference]:
+def _ends(twins: Twins, element: str, words: Sequence[str], here: Ends, there: Ends) -> Iterator[RobotDifference]:
     """The ends of an element that are others than in the file, by the attributes that name them."""
     for word, mine, theirs in zip(words, here, there, strict=False):
         if mine != theirs:
-            yield Difference(element, word, twins.shown_end(mine), twins.shown_end(theirs))
+            yield RobotDifference(element, word, twins.shown_end(mine), twins.shown_end(theirs))
 
 
-def _actuators(twins: Twins) -> Iterator[Difference]:
+def _actuators(twins: Twins) -> Iterator[RobotDifference]:
     file, built = twins.file, twins.stepped
     for actuator in range(min(file.nu, built.nu)):
         yield from _fields(twins, "actuator", actuator, actuator, ACTUATOR)
@@ -312,7 +314,7 @@ def _actuators(twins: Twins) -> Iterator[Difference]:
             yield from _ends(twins, twins.name("actuator", actuator), words, here, there)
 
 
-def _equalities(twins: Twins) -> Iterator[Difference]:
+def _equalities(twins: Twins) -> Iterator[RobotDifference]:
     file, built = twins.file, twins.stepped
     for equality, twin in twins.equalities.items():
         element = twins.name("equality", equality)
@@ -325,7 +327,7 @@ def _equalities(twins: Twins) -> Iterator[Difference]:
             yield from _unequal(element, name, mine[name], theirs, scale)
 
 
-def _options(twins: Twins) -> Iterator[Difference]:
+def _options(twins: Twins) -> Iterator[RobotDifference]:
     file, built = twins.file.opt, twins.built.opt
     yield from _unequal("option", "gravity", gravity(twins.built), gravity(twins.file))
     for name in ("wind", "density", "viscosity", "impratio", "cone", "disableactuator"):
@@ -335,26 +337,26 @@ def _options(twins: Twins) -> Iterator[Difference]:
         for bit in kind.__members__.values():
             if not bit.name.startswith("mjN") and bit.name not in ELSEWHERE and (mine ^ theirs) & int(bit):
                 word = bit.name.partition("_")[2].lower()
-                yield Difference("option", f"{name} {word}", bool(mine & int(bit)), bool(theirs & int(bit)))
+                yield RobotDifference("option", f"{name} {word}", bool(mine & int(bit)), bool(theirs & int(bit)))
 
 
-def _fields(twins: Twins, kind: str, index: int, twin: int, names: str) -> Iterator[Difference]:
+def _fields(twins: Twins, kind: str, index: int, twin: int, names: str) -> Iterator[RobotDifference]:
     element = twins.name({"jnt": "joint", "eq": "equality"}.get(kind, kind), index)
     for name in names.split():
         field = f"{kind}_{name}"
         yield from _unequal(element, name, getattr(twins.stepped, field)[twin], getattr(twins.file, field)[index])
 
 
-def _unequal(element: str, field: str, built: Any, file: Any, scale: float = 0.0) -> Iterator[Difference]:
+def _unequal(element: str, field: str, built: Any, file: Any, scale: float = 0.0) -> Iterator[RobotDifference]:
     mine, theirs = (np.clip(np.asarray(value, np.float64), -newton.MAXVAL, newton.MAXVAL) for value in (built, file))
     if mine.shape != theirs.shape:
-        yield Difference(element, field, built, file)
+        yield RobotDifference(element, field, built, file)
         return
     bounded = (mine != theirs) | (np.abs(mine) < newton.MAXVAL)  # of the open end of a range, nothing is to be compared
     mine, theirs = mine[bounded], theirs[bounded]
     greatest = max(scale, float(np.abs(theirs).max(initial=0.0)), float(np.abs(mine).max(initial=0.0)))
     if not (np.abs(mine - theirs) <= RELATIVE * greatest).all():
-        yield Difference(element, field, built, file)
+        yield RobotDifference(element, field, built, file)
 
 
 CHECKS = (_counts, _bodies, _joints, _geoms, _sites, _contacts, _pairs, _tendons, _actuators, _equalities)

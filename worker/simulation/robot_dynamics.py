@@ -16,7 +16,7 @@ RELATIVE = 1e-6
 ACCELERATION = 1e-3
 """Accelerations in the same state, and inverse weights, are equal up to this share of the greatest one."""
 Found = tuple[str, str, Any, Any]
-"""Element, field, and its values in the built robot and in the file, as of :class:`worker.simulation.robot_comparison.Difference`."""
+"""Element, field, and its values in the built robot and in the file, as of :class:`worker.simulation.robot_comparison.RobotDifference`."""
 
 
 def dynamics(twins: Twins, options: bool) -> Iterator[Found]:

@@ -13,7 +13,7 @@ import newton
 import numpy as np
 
 from shared_store.contract.policy import RobotModel
-from worker.simulation.robot_comparison import ACTUATOR, ELSEWHERE, SHARED, TENDON, Difference
+from worker.simulation.robot_comparison import ACTUATOR, ELSEWHERE, SHARED, TENDON, RobotDifference
 from worker.simulation.robot_connections import (
     Ends,
     actuator_ends,
@@ -49,7 +49,7 @@ MOST = 50
 
 
 def identity(
-    builder: newton.ModelBuilder, reference: Any, *, options: bool = True, accepted: Sequence[Difference] = ()
+    builder: newton.ModelBuilder, reference: Any, *, options: bool = True, accepted: Sequence[RobotDifference] = ()
 ) -> RobotModel:
     """Identify a robot, without a name.
 

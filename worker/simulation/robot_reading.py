@@ -25,10 +25,10 @@ from worker.simulation import actuators as actuation
 from worker.simulation import robot_comparison as robot_judge
 from worker.simulation import robot_files, robot_mjcf, robot_reference, robot_usd, robot_values
 from worker.simulation.carriers import keep_inertias
-from worker.simulation.robot_comparison import Comparison, Difference
+from worker.simulation.robot_comparison import Comparison, RobotDifference
 from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_identity import identity
-from worker.simulation.robot_reference import Reference
+from worker.simulation.robot_reference import ReferenceModel
 from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs
 from worker.simulation.solver import mark_sliders
@@ -60,7 +60,7 @@ SOLREF_DEFAULT = (0.02, 1.0)
 
 
 @dataclass(frozen=True)
-class Source:
+class ReadingOptions:
     """What decides how a robot's file is read.
 
     Attributes:
@@ -97,8 +97,8 @@ class Reading:
     """
 
     builder: newton.ModelBuilder
-    reference: Reference | None
-    corrected: tuple[Difference, ...]
+    reference: ReferenceModel | None
+    corrected: tuple[RobotDifference, ...]
     notes: tuple[str, ...]
     identity: RobotModel
 
@@ -128,7 +128,7 @@ class AnotherRobot(ValueError):
         accept: Patterns of differences that were accepted, and matched others, or none.
     """
 
-    def __init__(self, file: str, differences: Sequence[Difference], accept: Sequence[str] = ()) -> None:
+    def __init__(self, file: str, differences: Sequence[RobotDifference], accept: Sequence[str] = ()) -> None:
         self.differences = tuple(differences)
         first = differences[0]
         more = f", and {len(differences) - 1} more" if len(differences) > 1 else ""
@@ -141,7 +141,7 @@ class AnotherRobot(ValueError):
         )
 
 
-def read(source: Source) -> Reading:
+def read(source: ReadingOptions) -> Reading:
     """Read a robot's file.
 
     Raises:
@@ -166,7 +166,7 @@ def read(source: Source) -> Reading:
         found = _compared(source, builder, model)
         corrected = found.differences
     except Exception as error:  # whatever an importer stumbles over, MuJoCo's model is there
-        corrected = (Difference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
+        corrected = (RobotDifference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
         found, is_readable = Comparison(corrected, (), {}), False
     else:
         if file.format == "urdf" and corrected:
@@ -193,7 +193,7 @@ def read(source: Source) -> Reading:
     return Reading(builder, reference, corrected, tuple(notes), own)
 
 
-def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str) -> Reading:
+def _read_usd(source: ReadingOptions, file: RobotFile, floating: bool | None, name: str) -> Reading:
     builder = _imported(source, file, floating)
     found, corrected = robot_usd.judge(file.source, builder, source.ignore, name, source.accept)
     notes = found.notes
@@ -207,18 +207,18 @@ def _read_usd(source: Source, file: RobotFile, floating: bool | None, name: str)
     return Reading(builder, None, corrected, notes, identity(builder, None, accepted=found.accepted))
 
 
-def _accepted(source: Source, found: Comparison) -> Iterator[str]:
+def _accepted(source: ReadingOptions, found: Comparison) -> Iterator[str]:
     yield from (f"accepted: {each}" for each in found.accepted)
     for pattern in source.accept:
         if not any(robot_judge.matches(each, (pattern,)) for each in found.accepted):
             yield f"accept={pattern!r} matches no difference from the file"
 
 
-def _compared(source: Source, builder: newton.ModelBuilder, model: Any) -> Comparison:
+def _compared(source: ReadingOptions, builder: newton.ModelBuilder, model: Any) -> Comparison:
     return robot_judge.compare(model, builder, options=source.options, accept=source.accept)
 
 
-def _amended(source: Source, builder: newton.ModelBuilder, model: Any, found: Comparison) -> Comparison:
+def _amended(source: ReadingOptions, builder: newton.ModelBuilder, model: Any, found: Comparison) -> Comparison:
     """Correct what the importers don't read or can't say, and compare once more.
 
     They read whether there is gravity, but not which, and round moments of inertia; models enlarge small ones.
@@ -235,11 +235,11 @@ def _amended(source: Source, builder: newton.ModelBuilder, model: Any, found: Co
     return _compared(source, builder, model)
 
 
-def _ignored(source: Source) -> list[str]:
+def _ignored(source: ReadingOptions) -> list[str]:
     return [fnmatch.translate(pattern) for pattern in source.ignore]
 
 
-def _imported(source: Source, file: RobotFile, floating: bool | None) -> newton.ModelBuilder:
+def _imported(source: ReadingOptions, file: RobotFile, floating: bool | None) -> newton.ModelBuilder:
     """The robot as Newton's importer builds it."""
     builder = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(builder)

@@ -27,7 +27,7 @@ _KINDS = {"jnt": "joint", "dof": "dof", "eq": "equality"} | {
 
 
 @dataclass(frozen=True)
-class Reference:
+class ReferenceModel:
     """The compiled model of a robot's file.
 
     Attributes:
@@ -51,7 +51,7 @@ def compile_file(
     shown: str,
     is_placed: bool = True,
     has_contacts: bool = True,
-) -> Reference:
+) -> ReferenceModel:
     """Compile an MJCF or URDF file.
 
     Args:
@@ -90,7 +90,7 @@ def compile_file(
     _check_numbers(model, shown)
     notes += _empty_ranges(model)
     notes += robot_floor.notes(model, floors, is_placed=is_placed, has_contacts=has_contacts)
-    return Reference(model, tuple(notes), looks, sensors)
+    return ReferenceModel(model, tuple(notes), looks, sensors)
 
 
 def _is_ignored(name: str, ignored: Sequence[str]) -> bool:

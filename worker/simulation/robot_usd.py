@@ -15,9 +15,9 @@ from pxr import Usd, UsdGeom, UsdPhysics
 
 from worker.simulation import robot_usd_bodies, robot_usd_joints
 from worker.simulation.patterns import check_ignored
-from worker.simulation.robot_comparison import Comparison, Difference, matches
+from worker.simulation.robot_comparison import Comparison, RobotDifference, matches
 from worker.simulation.robot_elements import some
-from worker.simulation.robot_usd_stage import RELATIVE, Stage
+from worker.simulation.robot_usd_stage import RELATIVE, UsdStage
 
 
 class _Physx(SchemaResolverPhysx):
@@ -39,7 +39,7 @@ SCHEMAS = (SchemaResolverNewton(), SchemaResolverMjc(), _Physx())
 
 def judge(
     path: str, builder: newton.ModelBuilder, ignored: Sequence[str], shown: str, accept: Sequence[str]
-) -> tuple[Comparison, tuple[Difference, ...]]:
+) -> tuple[Comparison, tuple[RobotDifference, ...]]:
     """Compare a builder of one robot with its USD file, and correct it.
 
     Args:
@@ -72,7 +72,7 @@ def judge(
             f"{shown}: its joints ({some([prim.GetName() for prim in joints])}) belong to no articulation; apply "
             "PhysicsArticulationRootAPI to the prim above the robot"
         )
-    both = Stage(stage, shown, prims, builder)
+    both = UsdStage(stage, shown, prims, builder)
     faults = [*robot_usd_bodies.faults(both), *robot_usd_joints.faults(both)]
     if faults:
         raise ValueError(f"{shown} can't be held: {some(faults)}; change the file, or export it as MJCF or URDF")

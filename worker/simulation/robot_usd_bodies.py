@@ -11,10 +11,10 @@ import numpy as np
 import warp as wp
 from pxr import UsdPhysics, UsdShade
 
-from worker.simulation.robot_usd_stage import Stage, authored, quaternion, same_pose
+from worker.simulation.robot_usd_stage import UsdStage, authored, quaternion, same_pose
 
 
-def faults(both: Stage) -> Iterator[str]:
+def faults(both: UsdStage) -> Iterator[str]:
     """Bodies that are missing, or whose masses make no sense."""
     builder = both.builder
     moving = {child for child, dofs in zip(builder.joint_child, builder.joint_dof_dim, strict=True) if sum(dofs)}
@@ -33,7 +33,7 @@ def faults(both: Stage) -> Iterator[str]:
             yield f"body {path}: its moments of inertia {shown} are those of no body (each is at most the sum of the others)"
 
 
-def compare(both: Stage) -> None:
+def compare(both: UsdStage) -> None:
     """Correct places, masses, inertias, colliders and friction; name what can't be held."""
     for prim in _bodies(both):
         _compare_body(both, prim)
@@ -43,13 +43,13 @@ def compare(both: Stage) -> None:
             _compare_collider(both, prim, shapes)
 
 
-def _bodies(both: Stage) -> Iterator[Any]:
+def _bodies(both: UsdStage) -> Iterator[Any]:
     for prim in both.prims:
         if prim.HasAPI(UsdPhysics.RigidBodyAPI) and UsdPhysics.RigidBodyAPI(prim).GetRigidBodyEnabledAttr().Get():
             yield prim
 
 
-def _compare_body(both: Stage, prim: Any) -> None:
+def _compare_body(both: UsdStage, prim: Any) -> None:
     path, builder = str(prim.GetPath()), both.builder
     element, index = f"body {path}", both.bodies[path]
     place, pose = wp.transform(*builder.body_q[index]), both.pose(prim)
@@ -74,7 +74,7 @@ def _compare_body(both: Stage, prim: Any) -> None:
         builder.body_inv_inertia[index] = wp.mat33(*np.linalg.inv(np.array(tensor).reshape(3, 3)).ravel())
 
 
-def _compare_collider(both: Stage, prim: Any, shapes: dict[str, int]) -> None:
+def _compare_collider(both: UsdStage, prim: Any, shapes: dict[str, int]) -> None:
     path, builder = str(prim.GetPath()), both.builder
     element, enabled = f"collider {path}", bool(UsdPhysics.CollisionAPI(prim).GetCollisionEnabledAttr().Get())
     mine = [index for label, index in shapes.items() if label == path or label.startswith(f"{path}/")]

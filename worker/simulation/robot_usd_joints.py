@@ -14,7 +14,7 @@ from pxr import UsdPhysics
 
 from shared_store.contract.error_text import nearest
 from worker.simulation.robot_elements import some
-from worker.simulation.robot_usd_stage import PLACE, Stage, authored, plain, same, same_pose
+from worker.simulation.robot_usd_stage import PLACE, UsdStage, authored, plain, same, same_pose
 from worker.simulation.robot_view import actuator_value, actuators_of_dofs
 
 FREEDOMS = {"PhysicsRevoluteJoint": 1, "PhysicsPrismaticJoint": 1, "PhysicsSphericalJoint": 3, "PhysicsFixedJoint": 0}
@@ -31,7 +31,7 @@ NUMBERS = {
 """The builder's list, the word for a sentence, and the attributes of the schemas, of which the first one counts."""
 
 
-def faults(both: Stage) -> Iterator[str]:
+def faults(both: UsdStage) -> Iterator[str]:
     """Joints that are missing, that make no tree, or whose limits are no range."""
     builder = both.builder
     moved = {builder.body_label[child] for child in builder.joint_child}
@@ -67,7 +67,7 @@ def faults(both: Stage) -> Iterator[str]:
                 yield f"joint {path} has {count} degrees of freedom, in the file {there}"
 
 
-def compare(both: Stage) -> None:
+def compare(both: UsdStage) -> None:
     """Correct frames, axes, limits, positions and rotors of joints; name what can't be held."""
     drives = actuators_of_dofs(both.builder)
     for prim in _joints(both):
@@ -93,7 +93,7 @@ def compare(both: Stage) -> None:
             )
 
 
-def _joints(both: Stage) -> Iterator[Any]:
+def _joints(both: UsdStage) -> Iterator[Any]:
     for prim in both.prims:
         joint = UsdPhysics.Joint(prim)
         equality = any(schema.startswith("MjcEquality") for schema in prim.GetAppliedSchemas())
@@ -118,7 +118,7 @@ def _freedoms(prim: Any) -> int:
     return 6 - sum(_locked(prim, freedom) for freedom in limited if freedom != "distance")
 
 
-def _dofs(both: Stage, prim: Any, index: int) -> Iterator[tuple[int, str]]:
+def _dofs(both: UsdStage, prim: Any, index: int) -> Iterator[tuple[int, str]]:
     """Columns of a joint's degrees of freedom, and their names in USD's schema."""
     builder = both.builder
     first, (linear, angular) = builder.joint_qd_start[index], builder.joint_dof_dim[index]
@@ -130,7 +130,7 @@ def _dofs(both: Stage, prim: Any, index: int) -> Iterator[tuple[int, str]]:
             yield dof, ("trans" if dof - first < linear else "rot") + letter
 
 
-def _compare_frames(both: Stage, prim: Any, index: int) -> bool:
+def _compare_frames(both: UsdStage, prim: Any, index: int) -> bool:
     """Correct where a joint is on its two bodies; returns whether it moves the first of them, against USD's order."""
     builder, joint, element = both.builder, UsdPhysics.Joint(prim), f"joint {prim.GetPath()}"
     ends = [
@@ -154,7 +154,7 @@ def _compare_frames(both: Stage, prim: Any, index: int) -> bool:
     return reversed_
 
 
-def _compare_axes(both: Stage, prim: Any, index: int, reversed_: bool) -> None:
+def _compare_axes(both: UsdStage, prim: Any, index: int, reversed_: bool) -> None:
     builder, element = both.builder, f"joint {prim.GetPath()}"
     axis = prim.GetAttribute("physics:axis").Get() if prim.HasAttribute("physics:axis") else None
     if sum(builder.joint_dof_dim[index]) == 1 and axis:
@@ -165,7 +165,7 @@ def _compare_axes(both: Stage, prim: Any, index: int, reversed_: bool) -> None:
         both.differ(element, "the body that it moves", moved, "the other one")
 
 
-def _compare_position(both: Stage, prim: Any, index: int) -> None:
+def _compare_position(both: UsdStage, prim: Any, index: int) -> None:
     """Let a joint begin where the file places its bodies, unless the file gives its position or its frames are elsewhere."""
     builder, path = both.builder, str(prim.GetPath())
     if any(STATE.match(attribute.GetName()) for attribute in prim.GetAuthoredAttributes()):
@@ -199,7 +199,7 @@ def _compare_position(both: Stage, prim: Any, index: int) -> None:
         both.differ(f"body {builder.body_label[child]}", "place", built, pose)
 
 
-def _compare_limits(both: Stage, prim: Any, dof: int, freedom: str) -> None:
+def _compare_limits(both: UsdStage, prim: Any, dof: int, freedom: str) -> None:
     names = ("lowerLimit", "upperLimit") if freedom in ("angular", "linear") else ("low", "high")
     prefix = "physics:" if freedom in ("angular", "linear") else f"limit:{freedom}:physics:"
     shift = authored(prim, "mjc:ref") or 0.0
@@ -210,7 +210,7 @@ def _compare_limits(both: Stage, prim: Any, dof: int, freedom: str) -> None:
             both.correct(f"joint {prim.GetPath()}", prefix + name, values, dof, there)
 
 
-def _compare_numbers(both: Stage, prim: Any, dof: int, freedom: str) -> None:
+def _compare_numbers(both: UsdStage, prim: Any, dof: int, freedom: str) -> None:
     element, angle = f"joint {prim.GetPath()}", DEGREE if freedom in ANGULAR else 1.0
     for field, (word, *names) in NUMBERS.items():
         there = authored(prim, *names)
@@ -222,7 +222,7 @@ def _compare_numbers(both: Stage, prim: Any, dof: int, freedom: str) -> None:
         both.correct(element, "damping", both.builder.joint_damping, dof, there)
 
 
-def _compare_drive(both: Stage, prim: Any, dof: int, freedom: str, actuator: int | None) -> None:
+def _compare_drive(both: UsdStage, prim: Any, dof: int, freedom: str, actuator: int | None) -> None:
     """Compare a drive with the actuator that was made of it."""
     if not prim.HasAPI(UsdPhysics.DriveAPI, freedom):
         return

@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 from pxr import UsdGeom, UsdPhysics
 
-from worker.simulation.robot_comparison import Difference
+from worker.simulation.robot_comparison import RobotDifference
 
 RELATIVE = 1e-5
 """Two values are equal up to this share of the greatest one: USD keeps float32, and angles in degrees."""
@@ -21,7 +21,7 @@ PLACE = 1e-4
 
 
 @dataclass
-class Stage:
+class UsdStage:
     """A USD file beside the builder that was made of it.
 
     Attributes:
@@ -38,8 +38,8 @@ class Stage:
     shown: str
     prims: list[Any]
     builder: newton.ModelBuilder
-    corrected: list[Difference] = field(default_factory=list)
-    differences: list[Difference] = field(default_factory=list)
+    corrected: list[RobotDifference] = field(default_factory=list)
+    differences: list[RobotDifference] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
 
     @cached_property
@@ -93,7 +93,7 @@ class Stage:
         """
         built = values[index]
         if not same(built, file, within):
-            self.corrected.append(Difference(element, name, plain(built), plain(file)))
+            self.corrected.append(RobotDifference(element, name, plain(built), plain(file)))
             values[index] = file
 
     def note(self, text: str) -> None:
@@ -103,7 +103,7 @@ class Stage:
 
     def differ(self, element: str, name: str, built: Any, file: Any) -> None:
         """Say that the builder can't hold a value."""
-        self.differences.append(Difference(element, name, plain(built), plain(file)))
+        self.differences.append(RobotDifference(element, name, plain(built), plain(file)))
 
 
 def quaternion(value: Any) -> Any:

@@ -15,7 +15,7 @@ from worker.tasks.run.mistakes import task_mistakes
 from worker.tasks.run.policy_contract import robots_of
 
 if TYPE_CHECKING:
-    from worker.tasks.compile.plan import Plan
+    from worker.tasks.compile.plan import KernelPlan
     from worker.tasks.run.task import Task
 
 
@@ -58,7 +58,7 @@ def _robots(task: Task) -> list[str]:
     ] + list(task.notes())
 
 
-def _whole(plan: Plan) -> dict[str, Any]:
+def _whole(plan: KernelPlan) -> dict[str, Any]:
     curriculum = {name: [[*point] for point in points] for name, points in plan.config.curriculum.items()}
     return {"tables": tables(plan), "numbers": numbers(plan), "curriculum": curriculum}
 

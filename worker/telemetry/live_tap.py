@@ -19,7 +19,7 @@ from worker.learning.hooks import Hook
 from worker.learning.reporter import Gate
 from worker.simulation.episodes import WATCHED
 from worker.telemetry.segment import Segment
-from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.tap import Tap, TapReader
 from worker.telemetry.tap_request import answer_of, is_alive, request_of
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ class Attending:
         self._thread.join(5.0)
 
     def _work(self) -> None:
-        reading: Reading | None = None
+        reading: TapReader | None = None
         waited = 0.0
         while not self._over.wait(pause := self._pause()):
             # a volume that is away for a while, memory that is short: training goes on, and the reader says what it misses
@@ -100,7 +100,7 @@ class Attending:
             return LOOK_SECONDS
         return NEWEST_SECONDS if self._newest else DRAIN_SECONDS
 
-    def _answer(self) -> Reading | None:
+    def _answer(self) -> TapReader | None:
         """Answer a request once the tap has as many worlds as it asks for."""
         request = read_json(request_of(self._run))
         if request is None or answer_of(self._run).exists():
@@ -116,7 +116,7 @@ class Attending:
         if self._tap is None or self._tap.layout.worlds < worlds:
             self._wanted = worlds
             return None
-        reading = Reading(self._tap)
+        reading = TapReader(self._tap)
         reading.next = int(self._tap.count)
         segment = Segment.create(self._tap.layout)
         self._segment, self._reader = segment, (request["host"], request["process"])

@@ -59,7 +59,7 @@ def need_rerun() -> Path:
     return Path(next(iter(found.submodule_search_locations))) / "rerun"
 
 
-class Page:
+class ViewerPage:
     """Rerun's server and web viewer, until :meth:`close`.
 
     Args:
@@ -126,7 +126,7 @@ class Page:
         self._log.close()
         shutil.rmtree(self._home, ignore_errors=True)
 
-    def __enter__(self) -> Page:
+    def __enter__(self) -> ViewerPage:
         return self
 
     def __exit__(

@@ -20,10 +20,10 @@ import warp as wp
 from newton.sensors import SensorCamera
 
 from worker.settings.errors import UserError
-from worker.simulation.camera import look
 from worker.simulation.on_host import numbers
+from worker.simulation.world_cameras import look
 from worker.telemetry.stage import Stage
-from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.tap import Tap, TapReader
 
 if TYPE_CHECKING:
     from worker.settings.task import TaskConfig
@@ -44,7 +44,7 @@ _SMOOTH = 0.15
 """Share of the way to the robot that the camera goes in each frame, up and down; along the ground it keeps up."""
 
 
-class Camera:
+class StageCamera:
     """Takes pictures of a stage's worlds, tiled.
 
     Args:
@@ -161,11 +161,11 @@ class Glance:
 
     def picture(self, config: TaskConfig, width: int = 320, height: int = 180) -> bytes:
         """:data:`MOMENTS` frames of that size as one PNG."""
-        rows = Reading(self._tap).take()
+        rows = TapReader(self._tap).take()
         self._tap.close()
         length = int(np.argmax(rows.mark("done")[:, 0])) if rows.mark("done").any() else len(rows)
         span = max(1, min(length, round(_GLANCE_SECONDS * config.control_hz)))
-        camera = Camera(Stage(type(self._task), config, 1, self._task.device), width, height)
+        camera = StageCamera(Stage(type(self._task), config, 1, self._task.device), width, height)
         steps = np.linspace(0, span - 1, MOMENTS).round().astype(int)
         return encode([strip([camera.take(rows.coordinates[step]) for step in steps])], ".png", 1.0)
 

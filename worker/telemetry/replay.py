@@ -17,7 +17,7 @@ from worker.settings.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.intact_records import SoundRecords
 from worker.telemetry.recording import PARTIAL
-from worker.telemetry.screen import Look
+from worker.telemetry.screen import Appearance
 
 BATCH = 256
 """Control steps that are handed out together."""
@@ -26,7 +26,7 @@ _IMAGES = re.compile(r"/world_(\d+)/(.+)/image/compressed")
 
 
 @dataclass
-class Part:
+class RecordedSteps:
     """Consecutive control steps of a recording.
 
     Attributes:
@@ -104,7 +104,7 @@ class Replay:
                     cameras += [found[2]] if found[1] == "0" else []
         if terms is not None:
             own = tuple(link.removeprefix("world_0/") for link in links if link.startswith("world_0/"))
-            self.look = Look(own, shapes, np.array(places), terms, tuple(cameras))
+            self.look = Appearance(own, shapes, np.array(places), terms, tuple(cameras))
             self.cut = False
             return
         if steps:
@@ -115,7 +115,7 @@ class Replay:
         what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
         raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
 
-    def parts(self) -> Iterator[Part]:
+    def parts(self) -> Iterator[RecordedSteps]:
         """All control steps, in order."""
         found = _Gathered(self.look)
         with self._ours():
@@ -135,7 +135,7 @@ class Replay:
         if found.times:
             yield self._part(found)
 
-    def _part(self, found: _Gathered) -> Part:
+    def _part(self, found: _Gathered) -> RecordedSteps:
         first, self.count = self.count + 1, self.count + len(found.times)
         steps = np.arange(first, self.count + 1)
         rewards = np.array([np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in found.rewards])
@@ -144,7 +144,9 @@ class Replay:
             camera: {step: seen for step, seen in steps.items() if len(seen) == worlds}
             for camera, steps in found.images.items()
         }
-        return Part(np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns, images)
+        return RecordedSteps(
+            np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns, images
+        )
 
     @contextmanager
     def _ours(self) -> Iterator[None]:
@@ -187,7 +189,7 @@ class Replay:
 class _Gathered:
     """Control steps that are being read."""
 
-    look: Look
+    look: Appearance
     sums: defaultdict[int, float] = field(default_factory=lambda: defaultdict(float))
     """Return of each world's running episode."""
     times: list[int] = field(default_factory=list)

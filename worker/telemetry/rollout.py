@@ -21,7 +21,7 @@ from worker.learning.trained import find_checkpoint, load_policy
 from worker.tasks import find_task
 from worker.telemetry.rows import Rows
 from worker.telemetry.stage import Stage
-from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.tap import Tap, TapReader
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import Policy
@@ -95,7 +95,7 @@ class Rollout:
         """Act for at most ``most`` control steps from a fresh reset; after each of them its row."""
         tap = Tap(self.task, self.task.world_count, rows=2)  # one is read while the next is written
         tap.open()
-        reading = Reading(tap)
+        reading = TapReader(tap)
         self.task.reset()
         self.policy.reset()
         observations = observed(self.task)
@@ -124,7 +124,7 @@ class Rollout:
 
     def attachments(self) -> dict[str, bytes]:
         """The policy's contract, the policy as ONNX where its algorithm can export it, and the job that trained it."""
-        from worker.deploy.model import metadata_of, to_onnx
+        from worker.deploy.model_file import metadata_of, to_onnx
         from worker.tasks.run.policy_contract import policy_contract
 
         name, files = self.checkpoint.manifest["task"], {}

@@ -34,7 +34,7 @@ class Layout:
         terms: Names of the reward terms.
         control_hz: Control steps of a simulated second.
         images: The observation groups of images that are kept: name, channels (3: red, green and blue; 1), height and width [px].
-        causes: Names of what can end an episode, see :class:`worker.tasks.run.episode_records.Ended`.
+        causes: Names of what can end an episode, see :class:`worker.tasks.run.episode_records.LastEpisodes`.
     """
 
     worlds: int

@@ -38,7 +38,7 @@ _RECENT = 20.0
 
 
 @dataclass(frozen=True)
-class Look:
+class Appearance:
     """The stage of a few equal worlds.
 
     Attributes:
@@ -67,7 +67,7 @@ class Screen:
         live: Whether the newest state is followed; otherwise it is played from its beginning.
     """
 
-    def __init__(self, server: str | Path, title: str, look: Look, start: np.ndarray, live: bool) -> None:
+    def __init__(self, server: str | Path, title: str, look: Appearance, start: np.ndarray, live: bool) -> None:
         self._look = look
         self._terms: list[tuple[np.ndarray, np.ndarray, np.ndarray, int | None]] = []
         """The rows that :meth:`frames` has not sent yet: times, steps, reward terms, iteration."""

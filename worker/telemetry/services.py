@@ -25,7 +25,7 @@ _LONGEST = 6000
 """Characters of one of MLflow's parameters."""
 
 
-class Refused(Exception):
+class ServiceRefused(Exception):
     """The service can't be used as the job asks for it; the message, one line, says what to do."""
 
 
@@ -42,7 +42,7 @@ class Tracked:
 
 
 @dataclass(frozen=True)
-class Ending:
+class TrainingEnd:
     """The end of a training and the files uploaded then."""
 
     outcome: str
@@ -73,7 +73,7 @@ class Service(Protocol):
     def send(self, records: Sequence[Mapping[str, Any]]) -> None:
         """Send whole iterations, in order."""
 
-    def finish(self, ending: Ending) -> None:
+    def finish(self, ending: TrainingEnd) -> None:
         """Upload what there is at the end, and close the run."""
 
     def leave(self) -> None:
@@ -95,7 +95,7 @@ class WandB:
         known = self._wandb.setup(settings=self._wandb.Settings(silent=True, console="off")).settings
         mode = self._given.get("mode") or known.mode
         if mode == "disabled":
-            raise Refused("WANDB_MODE is disabled; remove wandb from track, or choose online or offline")
+            raise ServiceRefused("WANDB_MODE is disabled; remove wandb from track, or choose online or offline")
         self._offline = mode in ("offline", "dryrun")
         if self._offline:
             return
@@ -105,9 +105,9 @@ class WandB:
         except self._wandb.errors.UsageError:  # there is no terminal to ask at
             has_key = False
         except (self._wandb.Error, ValueError) as error:
-            raise Refused(f"{one_line(error).rstrip('.')}; {what_to_do}") from None
+            raise ServiceRefused(f"{one_line(error).rstrip('.')}; {what_to_do}") from None
         if not has_key:
-            raise Refused(f"there is no key for {known.base_url}; {what_to_do}")
+            raise ServiceRefused(f"there is no key for {known.base_url}; {what_to_do}")
 
     def open(self, identity: str | None, fresh: str) -> int:
         self.identity = identity or fresh
@@ -145,7 +145,7 @@ class WandB:
             time = {"_timestamp": record["time"]} if "time" in record else {}
             self._run.log({**scalars(record), **time}, step=record["iteration"])
 
-    def finish(self, ending: Ending) -> None:
+    def finish(self, ending: TrainingEnd) -> None:
         pictures = {f"media/{path.stem}": path for path in ending.files if path.suffix == ".png"}
         if pictures:  # a part of the last iteration
             images = {name: self._wandb.Image(str(path)) for name, path in pictures.items()}
@@ -174,12 +174,12 @@ class MLflow:
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
         uri = self._given.get("uri") or os.environ.get("MLFLOW_TRACKING_URI")
         if not uri:
-            raise Refused("there is no server: set track.mlflow.uri, or MLFLOW_TRACKING_URI where the job runs")
+            raise ServiceRefused("there is no server: set track.mlflow.uri, or MLFLOW_TRACKING_URI where the job runs")
         self._entities = _package("mlflow.entities")
         try:
             self._client = _package("mlflow").MlflowClient(uri)
         except Exception as error:  # MlflowException, and whatever else a URI leads to
-            raise Refused(one_line(error)) from None
+            raise ServiceRefused(one_line(error)) from None
 
     def open(self, identity: str | None, fresh: str) -> int:
         name = self._given.get("experiment") or os.environ.get("MLFLOW_EXPERIMENT_NAME") or self._tracked.task
@@ -228,7 +228,7 @@ class MLflow:
         for part in _parts(batch, _METRICS):
             self._client.log_batch(self.identity, metrics=part)
 
-    def finish(self, ending: Ending) -> None:
+    def finish(self, ending: TrainingEnd) -> None:
         for name, value in ending.figures.items():
             self._client.log_metric(self.identity, name, value, step=ending.last)
         for path in ending.files:
@@ -257,7 +257,7 @@ def _package(name: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        raise Refused(
+        raise ServiceRefused(
             f"{package} can't be imported where this job runs ({one_line(error)}); pip install 'muster[{package}]' there"
         ) from None
 

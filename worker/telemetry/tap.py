@@ -169,7 +169,7 @@ class Tap:
         wp.launch(_count, dim=1, inputs=[episodes.dones, self._ended, self._counter], device=self.device)
 
 
-class Reading:
+class TapReader:
     """Brings new rows of a tap to the host, on a stream of its own; the device's other work does not wait for it.
 
     Args:

@@ -9,13 +9,13 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api.batch import fargate, rules
+from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.control.compute_environments import is_built_in
 from orchestrator.domain.errors import ClientError
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy
+from orchestrator.persistence.batch_models import ComputeEnvironment, JobQueue, SchedulingPolicy
 from orchestrator.services.arns import compute_environment_arn, ecs_arn, iam_arn, plain_name, policy_arn
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation, Shared
@@ -28,8 +28,8 @@ def create_compute_environment(context: Context, request: dict[str, Any]) -> dic
     """CreateComputeEnvironment. Subnets, instance types and the like are kept and shown, and mean nothing to the engine."""
     context.actor.check(Operation.CREATE_COMPUTE_ENVIRONMENT, Shared())
     name = request["computeEnvironmentName"]
-    rules.check_name("computeEnvironmentName", name)
-    rules.check_tags(request.get("tags") or {})
+    validation.check_name("computeEnvironmentName", name)
+    validation.check_tags(request.get("tags") or {})
     if context.session.get(ComputeEnvironment, name):
         raise ClientError(f"Compute environment {name} exists already; UpdateComputeEnvironment changes it")
     if len(context.session.scalars(select(ComputeEnvironment.name)).all()) >= _MOST_COMPUTE_ENVIRONMENTS:
@@ -111,8 +111,8 @@ def create_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
     """CreateSchedulingPolicy with a fairsharePolicy."""
     context.actor.check(Operation.CREATE_SCHEDULING_POLICY, Shared())
     name = request["name"]
-    rules.check_name("name", name)
-    rules.check_tags(request.get("tags") or {})
+    validation.check_name("name", name)
+    validation.check_tags(request.get("tags") or {})
     if request.get("quotaSharePolicy"):
         raise ClientError("quotaSharePolicy is for service jobs, which are not supported; use fairsharePolicy")
     if context.session.get(SchedulingPolicy, name):
@@ -209,7 +209,7 @@ def _check_members(request: Mapping[str, Any]) -> None:
         *(f"launchTemplate userdataType {kind[:50]}" for each in templates if (kind := each.get("userdataType"))),
     ]
     if of_eks:
-        raise ClientError(f"{of_eks[0]} {rules.NO_KUBERNETES} leave it out")
+        raise ClientError(f"{of_eks[0]} {validation.NO_KUBERNETES} leave it out")
     insights = (request.get("ecsSettings") or {}).get("containerInsights") or "DISABLED"
     if insights not in ("ENABLED", "ENHANCED", "DISABLED"):
         raise ClientError(f"containerInsights is {insights[:50]!r}; it is ENABLED, ENHANCED or DISABLED")

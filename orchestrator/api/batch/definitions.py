@@ -6,11 +6,11 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api.batch import fargate, rules
+from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.descriptions import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.models import JobDefinition
+from orchestrator.persistence.batch_models import JobDefinition
 from orchestrator.services import permissions
 from orchestrator.services.arns import definition_arn, plain_name
 from orchestrator.services.context import Context
@@ -23,20 +23,20 @@ _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 def register_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """RegisterJobDefinition; each registration of a name is a new revision."""
     name, kind = request["jobDefinitionName"], request["type"]
-    rules.check_name("jobDefinitionName", name)
-    rules.check_tries(request)
-    rules.check_tags(request.get("tags") or {})
-    rules.check_priority("schedulingPriority", request.get("schedulingPriority"))
+    validation.check_name("jobDefinitionName", name)
+    validation.check_tries(request)
+    validation.check_tags(request.get("tags") or {})
+    validation.check_priority("schedulingPriority", request.get("schedulingPriority"))
     wanted = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
     if wanted is None:
         raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")
     if request.get("eksProperties"):
-        raise ClientError(f"job definition {name}: eksProperties {rules.NO_KUBERNETES} use {' or '.join(wanted)}")
+        raise ClientError(f"job definition {name}: eksProperties {validation.NO_KUBERNETES} use {' or '.join(wanted)}")
     given = [key for key in _PROPERTIES if request.get(key)]
     if len(given) != 1 or given[0] not in wanted:
         raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
-    properties = rules.node_properties(request)
-    gang = rules.check_nodes(properties, kind)
+    properties = validation.node_properties(request)
+    gang = validation.check_nodes(properties, kind)
     fargate.check_platform(request, properties, f"job definition {name}")
     document = {key: value for key, value in request.items() if key != "tags"}
     added = revision(context, name, document, gang, request.get("tags"))

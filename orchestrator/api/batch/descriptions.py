@@ -9,7 +9,7 @@ from typing import Any
 from orchestrator.api.batch.ecs import to_ecs
 from orchestrator.api.batch.fargate import is_fargate
 from orchestrator.domain.job import Ending, Status, container_reason, has_exited
-from orchestrator.persistence.models import Attempt, Job, JobDefinition
+from orchestrator.persistence.batch_models import Attempt, Job, JobDefinition
 from orchestrator.services.arns import ecs_arn, job_arn, queue_arn
 from orchestrator.services.damaged_rows import DAMAGED
 

@@ -7,7 +7,7 @@ from orchestrator.domain.errors import ClientError
 from orchestrator.domain.retention import TAG, rule_of
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.installed import ENGINES, check_tags
-from orchestrator.persistence.models import ComputeEnvironment, JobQueue
+from orchestrator.persistence.batch_models import ComputeEnvironment, JobQueue
 from orchestrator.services.context import Context
 from shared_store.contract.error_text import nearest
 

@@ -12,7 +12,7 @@ from orchestrator.api.batch.descriptions import array_properties, describe_damag
 from orchestrator.api.batch.paging import decode, encode, page, page_size
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.services.arns import definition_arn, queue_arn, split_reference
 from orchestrator.services.context import Context
 from orchestrator.services.damaged_rows import DamagedRow, reading

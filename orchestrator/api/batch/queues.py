@@ -7,14 +7,14 @@ from typing import Any
 
 from sqlalchemy import select
 
-from orchestrator.api.batch import fargate, rules
+from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.usage import utilization
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
+from orchestrator.persistence.batch_models import ComputeEnvironment, JobQueue, SchedulingPolicy, now
 from orchestrator.services.arns import compute_environment_arn, job_arn, plain_name, policy_arn, queue_arn
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import JobsOf, Operation, Shared
@@ -30,8 +30,8 @@ _REASONS = (
 def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CreateJobQueue."""
     name = request["jobQueueName"]
-    rules.check_name("jobQueueName", name)
-    rules.check_tags(request.get("tags") or {})
+    validation.check_name("jobQueueName", name)
+    validation.check_tags(request.get("tags") or {})
     context.actor.check(Operation.CREATE_JOB_QUEUE, Shared())
     if context.session.get(JobQueue, name):
         raise ClientError(f"Job queue {name} exists already; UpdateJobQueue changes it")
@@ -143,7 +143,7 @@ def _check_kind(request: Mapping[str, Any]) -> None:
     if request.get("serviceEnvironmentOrder"):
         raise ClientError("serviceEnvironmentOrder is not supported; use computeEnvironmentOrder")
     if (kind := request.get("jobQueueType")) == "EKS":
-        raise ClientError(f"jobQueueType EKS {rules.NO_KUBERNETES} use ECS or ECS_FARGATE")
+        raise ClientError(f"jobQueueType EKS {validation.NO_KUBERNETES} use ECS or ECS_FARGATE")
     if kind not in (None, "ECS", "ECS_FARGATE"):
         raise ClientError(f"jobQueueType {kind[:50]!r} is not supported; use ECS or ECS_FARGATE")
 

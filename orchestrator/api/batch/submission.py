@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from orchestrator.api.batch import fargate, rules
+from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.members import check_consumables
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.services.arns import split_reference
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation
@@ -28,17 +28,17 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 def _submission(context: Context, request: Mapping[str, Any]) -> Submission:
     """The request as it is meant. Raises ClientError."""
-    rules.check_name("jobName", request["jobName"])
-    rules.check_tries(request)
-    rules.check_tags(request.get("tags") or {})
+    validation.check_name("jobName", request["jobName"])
+    validation.check_tries(request)
+    validation.check_tags(request.get("tags") or {})
     queue, override = context.queue(request["jobQueue"]), request.get("schedulingPriorityOverride")
     share = open_queue(context, queue, request.get("shareIdentifier"), override)
     definition = context.definition(request["jobDefinition"])
     context.actor.check(Operation.SUBMIT_JOB, definition)
     document = definition.document
     parameters = {**(document.get("parameters") or {}), **(request.get("parameters") or {})}
-    properties = rules.substitute(_properties(document, request), parameters)
-    gang = rules.check_nodes(properties, document["type"])
+    properties = validation.substitute(_properties(document, request), parameters)
+    gang = validation.check_nodes(properties, document["type"])
     fargate.check_platform(document, properties, f"job definition {definition.name}")
     fargate.check_queue(queue.name, [each.document for each in environments_of(context.session, queue)], document)
     retry = request.get("retryStrategy") or document.get("retryStrategy") or {}
@@ -67,7 +67,7 @@ def _submission(context: Context, request: Mapping[str, Any]) -> Submission:
 
 def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict[str, Any]:
     """The job's node properties, with the overrides that fit its type."""
-    properties = rules.node_properties(document)
+    properties = validation.node_properties(document)
     if document["type"] == "multinode":
         check_consumables(request, "the job")
         for key in ("containerOverrides", "ecsPropertiesOverride", "eksPropertiesOverride"):
@@ -75,10 +75,10 @@ def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict
                 raise ClientError(f"{key} is not for a multi-node parallel job; use nodeOverrides")
         if request.get("arrayProperties"):
             raise ClientError("arrayProperties is not for a multi-node parallel job; submit the jobs one by one")
-        return rules.override_nodes(properties, request.get("nodeOverrides") or {})
+        return validation.override_nodes(properties, request.get("nodeOverrides") or {})
     if request.get("nodeOverrides"):
         raise ClientError("nodeOverrides is for multi-node parallel jobs; use containerOverrides")
-    rules.override_range(properties["nodeRangeProperties"][0], request, "container")
+    validation.override_range(properties["nodeRangeProperties"][0], request, "container")
     return properties
 
 

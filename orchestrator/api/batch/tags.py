@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.api.batch import rules
+from orchestrator.api.batch import validation
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
+from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 from orchestrator.services.arns import split_arn
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation
@@ -24,7 +24,7 @@ def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """Add tags, or replace their values."""
     resource = _resource(context, request["resourceArn"], Operation.TAG_RESOURCE)
     tags = {**resource.tags, **request["tags"]}
-    rules.check_tags(tags)
+    validation.check_tags(tags)
     check_engine_tags(context, resource, tags)
     resource.tags = tags
     return {}

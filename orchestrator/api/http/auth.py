@@ -30,7 +30,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from orchestrator.api.http import foreign_services as elsewhere
 from orchestrator.api.http.access import Access, actor_of_key
 from orchestrator.api.http.callers import Caller, user_name
-from orchestrator.api.http.limits import Body, RateLimit
+from orchestrator.api.http.limits import RateLimit, RequestBody
 from orchestrator.domain.errors import ClientError, RequestError
 from orchestrator.domain.excerpts import LONGEST_ERROR, excerpt
 from orchestrator.services.permissions import BY_LOWER_NAME, Actor, Refusal
@@ -78,7 +78,7 @@ class Guard:
         if scope["type"] == "http" and (service := request.foreign_service) is not None:
             await elsewhere.refusal(service, request.first_of_each())(scope, receive, send)
             return
-        body = Body(receive, request.first("content-length"), request.operation)
+        body = RequestBody(receive, request.first("content-length"), request.operation)
         try:
             actor = await self._admit(request, body, scope.get("state", {}).get("caller"))
             if scope["type"] == "http":
@@ -96,7 +96,7 @@ class Guard:
         scope.setdefault("state", {})["actor"] = actor
         await self.app(scope, body.receive, _with_request_id(send))
 
-    async def _admit(self, request: _Request, body: Body, caller: Caller | None) -> Actor:
+    async def _admit(self, request: _Request, body: RequestBody, caller: Caller | None) -> Actor:
         """The sender of the request. Raises ClientError if it is refused."""
         demanded = self.access.demanded()
         request.check_browser(loopback_only=not demanded)
@@ -152,14 +152,14 @@ class Guard:
         if reason := self.limit.refusal(actor.name, operation):
             raise Refusal("TooManyRequestsException", reason, 429)
 
-    async def _authenticate(self, request: _Request, body: Body) -> Actor:
+    async def _authenticate(self, request: _Request, body: RequestBody) -> Actor:
         given = request.single("authorization") or ""
         scheme, _, credentials = given.strip().partition(" ")
         if scheme.lower() == "bearer":
             await self._look_for(credentials.strip().partition(":")[0])
             return self.access.bearer(credentials.strip())
         if scheme == _ALGORITHM:
-            claim = Claim.parse(credentials)
+            claim = AuthorizationHeader.parse(credentials)
             await self._look_for(claim.access_key_id)
             key = self.access.known().get(claim.access_key_id)
             if key is None:
@@ -267,7 +267,7 @@ def is_loopback(host: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Claim:
+class AuthorizationHeader:
     """An Authorization header of Signature Version 4: which key, at what time, signed which headers."""
 
     access_key_id: str
@@ -278,7 +278,7 @@ class Claim:
     signature: str
 
     @classmethod
-    def parse(cls, credentials: str) -> Claim:
+    def parse(cls, credentials: str) -> AuthorizationHeader:
         """The fields after the algorithm's name in the header. Raises Refusal."""
         parts: dict[str, str] = {}
         for part in credentials.split(","):

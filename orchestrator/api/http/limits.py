@@ -92,7 +92,7 @@ def _too_large(operation: str, limit: int) -> ClientError:
     return ClientError(f"{operation}: the request has more than {limit} bytes{shorten}", 413)
 
 
-class Body:
+class RequestBody:
     """The body of an HTTP request: read whole within its limit, then given to the application as if it were just coming."""
 
     def __init__(self, receive: Receive, declared: str | None, operation: str) -> None:

@@ -10,15 +10,15 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from orchestrator.api.batch.members import check_log_group
-from orchestrator.api.batch.rules import check_tags
+from orchestrator.api.batch.validation import check_tags
 from orchestrator.api.logs.errors import LogsError, absent, invalid, present
-from orchestrator.api.logs.events import stored_bytes
+from orchestrator.api.logs.log_events import stored_bytes
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.persistence import log_groups
-from orchestrator.persistence.models import Job, Node
+from orchestrator.persistence.batch_models import Job, Node
 from orchestrator.persistence.own_models import LogGroup, LogStream
 from orchestrator.services import permissions
 from orchestrator.services.arns import log_group_arn

@@ -14,14 +14,14 @@ from typing import Any
 
 from orchestrator.api.http.answer_streams import MEMORY_PIECE, looked, pause
 from orchestrator.api.logs import eventstream
-from orchestrator.api.logs.events import Event, is_event, milliseconds
 from orchestrator.api.logs.filter import Matcher
+from orchestrator.api.logs.log_events import LogEvent, is_event, milliseconds
 from orchestrator.api.logs.streams import Stream, newest_streams
 from orchestrator.control.controller import Controller
 from orchestrator.control.log_hub import Waker
 from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.store_calls import StoreSilent
-from orchestrator.persistence.models import now
+from orchestrator.persistence.batch_models import now
 from orchestrator.services.permissions import Actor
 from shared_store.volume.layout import Run
 from shared_store.volume.log_view import Chosen, Key, LogView
@@ -65,14 +65,14 @@ class _Job:
         """Whether no more lines can come, as the database had it before the files were looked at."""
         return not any(stream.live for stream in self.streams.values())
 
-    def events(self, lines: Iterable[LogLine]) -> Iterator[Event]:
+    def events(self, lines: Iterable[LogLine]) -> Iterator[LogEvent]:
         """The events of those lines that are in a stream."""
         for line in lines:
             key = line.attempt, line.node
             if key in self.streams and is_event(line):
                 time = self.newest[key] = max(self.newest.get(key, 0), milliseconds(line.time))
                 stream = self.streams[key]
-                yield Event(time, stream.file.source, line.position, line.position, stream.name, line.text)
+                yield LogEvent(time, stream.file.source, line.position, line.position, stream.name, line.text)
 
 
 class LiveTail:
@@ -135,22 +135,22 @@ class LiveTail:
         self._is_asked.set()
         self.waker.wake()
 
-    def poll_memory(self) -> list[Event] | None:
+    def poll_memory(self) -> list[LogEvent] | None:
         """The events since the last call, in order; None where only the files, or the database, have them."""
         is_due = self._is_asked.is_set() and time.monotonic() >= self._next_refresh
         if is_due or any(job.view.in_files for job in self._jobs.values()):
             return None
-        events = list[Event]()
+        events = list[LogEvent]()
         for job in self._jobs.values():
             if job.logs is not None:
                 events += job.events(job.view.poll_memory(job.logs, MEMORY_PIECE) or ())
         return self._chosen(events)
 
-    def poll(self) -> list[Event]:
+    def poll(self) -> list[LogEvent]:
         """:meth:`poll_memory` with the files and the database. Raises OSError."""
         if self._is_asked.is_set():
             self._refresh(from_now=False)
-        events = list[Event]()
+        events = list[LogEvent]()
         for job in self._jobs.values():
             if job.view.in_files:
                 events += job.events(job.view.poll())
@@ -162,7 +162,7 @@ class LiveTail:
         """Whether there is more already."""
         return any(job.view.in_files or job.view.behind for job in self._jobs.values())
 
-    def _chosen(self, events: Iterable[Event]) -> list[Event]:
+    def _chosen(self, events: Iterable[LogEvent]) -> list[LogEvent]:
         return sorted(event for event in events if self._matches(event.text))
 
     def _refresh(self, *, from_now: bool) -> None:
@@ -243,7 +243,7 @@ async def messages(
             await asyncio.sleep(pause(_PAUSE))
 
 
-async def _polled(tail: LiveTail) -> tuple[list[Event], bool]:
+async def _polled(tail: LiveTail) -> tuple[list[LogEvent], bool]:
     """The new events, from memory where that has them, else from the files; and whether some of them were left out."""
     found = await looked(tail.poll_memory, None)
     if found is None:
@@ -253,13 +253,13 @@ async def _polled(tail: LiveTail) -> tuple[list[Event], bool]:
     return found, False
 
 
-def _updates(events: list[tuple[Event, str]], sampled: bool) -> Iterator[bytes]:
+def _updates(events: list[tuple[LogEvent, str]], sampled: bool) -> Iterator[bytes]:
     """One sessionUpdate for every MOST_EVENTS events, each with its group; an empty one where there are none."""
     batches = [events[first : first + MOST_EVENTS] for first in range(0, len(events), MOST_EVENTS)] or [[]]
     return (_update(batch, sampled) for batch in batches)
 
 
-def _update(events: list[tuple[Event, str]], sampled: bool) -> bytes:
+def _update(events: list[tuple[LogEvent, str]], sampled: bool) -> bytes:
     results = [
         {
             "logStreamName": event.stream,

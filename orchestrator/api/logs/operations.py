@@ -27,12 +27,12 @@ from orchestrator.api.http.limits import check_size
 from orchestrator.api.logs import filter as log_filter
 from orchestrator.api.logs import groups
 from orchestrator.api.logs.errors import JSON, LogsError, absent, invalid
-from orchestrator.api.logs.events import Event, event_id, first_and_last
 from orchestrator.api.logs.live_tail import LiveTail, messages
+from orchestrator.api.logs.log_events import LogEvent, event_id, first_and_last
 from orchestrator.api.logs.streams import Stream, created_streams, find_stream, newest_streams
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import RequestError, Unavailable
-from orchestrator.persistence.models import now
+from orchestrator.persistence.batch_models import now
 from orchestrator.services.arns import here, log_group_arn
 from orchestrator.services.permissions import Actor, Operation, Refusal
 
@@ -167,7 +167,7 @@ def filter_log_events(controller: Controller, actor: Actor, request: dict[str, A
         before = min(before, newest)
     reached = (int(token[2]), int(token[3]), int(token[4])) if token else None
     views = [stream.file.look() for stream in streams]
-    events: Iterator[Event]
+    events: Iterator[LogEvent]
     if ascending:
         start = max(since, reached[0]) if reached else since
         events = heapq.merge(*(view.forward(start) for view in views))
@@ -316,20 +316,20 @@ def _pattern(text: str) -> log_filter.Matcher:
         raise invalid(f"Invalid filter pattern: {error}") from None
 
 
-def _until(events: Iterator[Event], over: Callable[[Event], bool]) -> Iterator[Event]:
+def _until(events: Iterator[LogEvent], over: Callable[[LogEvent], bool]) -> Iterator[LogEvent]:
     for event in events:
         if over(event):
             return
         yield event
 
 
-def _size(event: Event) -> int:
+def _size(event: LogEvent) -> int:
     return len(event.text.encode()) + 26
 
 
-def _page(events: Iterator[Event], limit: int) -> list[Event]:
+def _page(events: Iterator[LogEvent], limit: int) -> list[LogEvent]:
     """The first events that fit on a page; one at least."""
-    page: list[Event] = []
+    page: list[LogEvent] = []
     size = 0
     for event in islice(events, limit):
         size += _size(event)
@@ -339,9 +339,11 @@ def _page(events: Iterator[Event], limit: int) -> list[Event]:
     return page
 
 
-def _search(events: Iterator[Event], matches: log_filter.Matcher, limit: int) -> tuple[list[Event], Event | None]:
+def _search(
+    events: Iterator[LogEvent], matches: log_filter.Matcher, limit: int
+) -> tuple[list[LogEvent], LogEvent | None]:
     """The matching events of a page, and the last one that was looked at, where there may be more after it."""
-    page: list[Event] = []
+    page: list[LogEvent] = []
     size, last = 0, None
     deadline = time.monotonic() + _LONGEST_SEARCH
     for event in events:

@@ -12,9 +12,9 @@ from sqlalchemy import String, and_, func, literal, or_, select
 from sqlalchemy.orm import Session, joinedload, load_only, raiseload
 
 from orchestrator.api.batch.descriptions import stream_name
-from orchestrator.api.logs.events import LogFile, log_file
+from orchestrator.api.logs.log_events import LogFile, log_file
 from orchestrator.domain.gang import LOG_GROUP
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.own_models import LogStream
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume.layout import Run, Store

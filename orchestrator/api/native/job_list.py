@@ -16,13 +16,13 @@ from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.control.controller import Controller
-from orchestrator.control.run_store import RunFacts, facts_of
+from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.control.store_calls import StoreSilent
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
 from orchestrator.domain.reasons import Reason, array_of
+from orchestrator.persistence.batch_models import Job, RunRecord
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
-from orchestrator.persistence.models import Job, RunRecord
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.services.context import queue_names
 from orchestrator.services.damaged_rows import DAMAGED, DamagedRow, reading
@@ -248,7 +248,7 @@ def _progress(controller: Controller, actor: Actor, trainings: Sequence[_Trainin
 
 def _read(
     actor: Actor, store: Store, trainings: Sequence[_Training]
-) -> tuple[Mapping[str, Sequence[Mapping[str, Any]]], Mapping[str, RunFacts]]:
+) -> tuple[Mapping[str, Sequence[Mapping[str, Any]]], Mapping[str, ObservedRun]]:
     """By job its curve, and by name the runs whose owners must be known."""
     read = {each.job.id: curves.of(store.run(each.job.run), each.job) for each in trainings}
     names = {each.job.run for each in trainings} if actor.queues is not None else set()

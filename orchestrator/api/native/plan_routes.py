@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from pydantic import BaseModel, Field
 
-from orchestrator.api.batch import rules
+from orchestrator.api.batch import validation
 from orchestrator.api.batch.operations import validate
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
@@ -20,7 +20,7 @@ from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job
+from orchestrator.persistence.batch_models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
 from orchestrator.services.context import permitted_run
 from orchestrator.services.evaluated_checkpoints import check_evaluation
@@ -123,7 +123,7 @@ def _gang_of(body: PlanRequest) -> GangSpec:
     definition = validate("RegisterJobDefinition", body.definition)
     if definition["type"] != "multinode" or "nodeProperties" not in definition:
         raise ClientError("definition: a plan is made of a job of type multinode, with nodeProperties")
-    return rules.check_nodes(rules.node_properties(definition), "multinode")
+    return validation.check_nodes(validation.node_properties(definition), "multinode")
 
 
 def _planned(controller: Controller, gang: Gang) -> Plan[Any]:

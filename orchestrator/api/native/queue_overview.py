@@ -19,8 +19,8 @@ from orchestrator.control.usage import held_by, placements_of, usage_at
 from orchestrator.domain.hosts import Capacity, Queued, engine_of
 from orchestrator.domain.job import Status
 from orchestrator.domain.resources import Resources
+from orchestrator.persistence.batch_models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
 from orchestrator.persistence.job_counts import JobCounts
-from orchestrator.persistence.models import Attempt, ComputeEnvironment, Job, JobQueue, SchedulingPolicy
 from orchestrator.scheduling.order import score, weight
 from orchestrator.scheduling.snapshot import Queue
 from orchestrator.services.fit import UnknownQueue

@@ -38,7 +38,7 @@ from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named, short_id
 from orchestrator.engines.registry import FRESH
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.ownership import is_of_earlier_run, owner_of
 from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.services import runs

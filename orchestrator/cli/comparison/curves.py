@@ -7,7 +7,7 @@ import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from shared_store.volume.comparison import Group
+from shared_store.volume.comparison import RunGroup
 from shared_store.volume.files import write_atomic
 
 Curves = Sequence[tuple[str, Sequence[tuple[float, float, float, int]]]]
@@ -17,7 +17,7 @@ ENDINGS = (".png", ".svg", ".pdf", ".csv")
 """Endings of the files that can be written."""
 
 
-def draw(groups: Sequence[Group], path: Path) -> None:
+def draw(groups: Sequence[RunGroup], path: Path) -> None:
     """Write each group's mean return over environment steps, with one standard deviation over its runs.
 
     The file is a picture with one line and band per group, or a table of ``group``, ``env_steps``, ``return``, ``std`` and ``runs``.

@@ -41,7 +41,7 @@ from orchestrator.engines.api import (
 )
 from orchestrator.engines.aws_batch import TRAITS
 from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
-from orchestrator.engines.aws_batch.logs import GangLogs, NodeLog
+from orchestrator.engines.aws_batch.logs import CopiedLog, GangLogs
 from orchestrator.engines.aws_batch.node_status import node_ended, waiting, waits
 from orchestrator.engines.aws_batch.requests import DIGEST, Requests, requests_for
 from orchestrator.engines.toolkit.looks import one_by_one
@@ -49,7 +49,7 @@ from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
 from shared_store.contract.error_text import counted
-from shared_store.volume.outcomes import EX_TEMPFAIL, Outcome
+from shared_store.volume.node_outcomes import EX_TEMPFAIL, Outcome
 
 _PORT = 29500
 _GRACE = 25.0
@@ -358,7 +358,7 @@ class AwsBatchEngine:
             return NodeStatus(NodePhase.RUNNING, address)  # it has ended, but how is still on its way
         return node_ended(address, code, str(reason), code is None and detail.get("statusReason") == AWS_NOT_STARTED)
 
-    def _settled(self, handle: Handle, watched: _Watched, log: NodeLog | None, outcome: Outcome) -> bool:
+    def _settled(self, handle: Handle, watched: _Watched, log: CopiedLog | None, outcome: Outcome) -> bool:
         """Whether the store has the node's outcome; it is written here if it was missing."""
         if recorded(handle, outcome.node) is not None:
             return True
@@ -370,7 +370,7 @@ class AwsBatchEngine:
 
     def _follow(
         self, handle: Handle, watched: _Watched, index: int, container: Mapping[str, Any], over: bool
-    ) -> NodeLog | None:
+    ) -> CopiedLog | None:
         """The copy of a node's log; None where the supervisor writes it to the store that is here, too."""
         with self._lock:  # a gang that is being stopped is looked at by two threads
             logs = watched.logs = watched.logs or self._copies(handle)
@@ -382,7 +382,7 @@ class AwsBatchEngine:
         """The copies of a gang's logs, begun."""
         shared = self._is_shared(handle.facts["store"])
         nodes = [
-            NodeLog(*log_of(handle, index), supervised, copied=not (supervised and shared))
+            CopiedLog(*log_of(handle, index), supervised, copied=not (supervised and shared))
             for index, supervised in enumerate(handle.facts["supervised"])
         ]
         logs = GangLogs(self._logs, nodes, self.config.poll, self.config.quiet)

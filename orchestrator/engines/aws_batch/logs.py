@@ -18,7 +18,7 @@ from botocore.parsers import ResponseParserError
 from orchestrator.engines.toolkit.log_copy import LogCopy
 from shared_store.volume.files import DamagedFile, json_object
 from shared_store.volume.logs import OUTCOME_LINE, format_line, parse_line
-from shared_store.volume.outcomes import Outcome, parse_outcome
+from shared_store.volume.node_outcomes import Outcome, parse_outcome
 
 _PACE = 0.05
 """Seconds between two requests: CloudWatch answers 25 a second for the whole account."""
@@ -28,7 +28,7 @@ _LAST_WAIT = 20.0
 
 
 @dataclass
-class NodeLog:
+class CopiedLog:
     """The copy of one node's log."""
 
     path: Path
@@ -110,7 +110,7 @@ class GangLogs:
 
     client: Any
     """Of CloudWatch Logs."""
-    nodes: list[NodeLog]
+    nodes: list[CopiedLog]
     poll: float
     """Seconds between two rounds."""
     quiet: float
@@ -125,7 +125,7 @@ class GangLogs:
         self._thread = threading.Thread(target=self._follow, name=f"log {name}", daemon=True)
         self._thread.start()
 
-    def saw(self, index: int, group: str, stream: str | None, ended: bool) -> NodeLog:
+    def saw(self, index: int, group: str, stream: str | None, ended: bool) -> CopiedLog:
         """AWS's facts about a node: its log group, the name of its stream, and whether it has ended."""
         node = self.nodes[index]
         if stream:
@@ -159,7 +159,7 @@ class GangLogs:
         for node in self.nodes:
             node.close()
 
-    def _copy(self, node: NodeLog) -> None:
+    def _copy(self, node: CopiedLog) -> None:
         """All that has come since the last look."""
         try:
             if node.stream is not None:

@@ -31,7 +31,7 @@ _CANCELLED = ("cancelled", "The following resource(s) failed")
 
 
 @dataclass(frozen=True)
-class Event:
+class StackEvent:
     """One thing that happened to a resource of the stack."""
 
     time: str
@@ -119,7 +119,7 @@ class Stack:
             self._api.delete_stack(StackName=found["StackId"])
         return str(found["StackId"])
 
-    def follow(self, stack: str, since: float) -> Iterator[Event]:
+    def follow(self, stack: str, since: float) -> Iterator[StackEvent]:
         """Events of the stack (an id) from ``since`` (Unix time [s]) on, until it rests."""
         seen: set[str] = set()
         while True:
@@ -222,8 +222,8 @@ def _parameters(template: str) -> list[str]:
         raise ServerError(f"the template is no CloudFormation template: {error}") from None
 
 
-def _event(raw: Mapping[str, Any]) -> Event:
-    return Event(
+def _event(raw: Mapping[str, Any]) -> StackEvent:
+    return StackEvent(
         raw["Timestamp"].astimezone().strftime("%H:%M:%S"),
         raw["LogicalResourceId"],
         raw.get("ResourceType", ""),
@@ -232,7 +232,7 @@ def _event(raw: Mapping[str, Any]) -> Event:
     )
 
 
-def first_failure(events: Sequence[Event]) -> str:
+def first_failure(events: Sequence[StackEvent]) -> str:
     """The first resource that failed, and why; empty where none did."""
     failed = next((event for event in events if event.is_failure), None)
     return f"{failed.resource} ({failed.kind}): {failed.reason or failed.status}" if failed else ""

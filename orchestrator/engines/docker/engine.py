@@ -58,7 +58,7 @@ from shared_store import __version__
 from shared_store.contract.error_text import counted
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import OUT_OF_MEMORY, read_outcome
+from shared_store.volume.node_outcomes import OUT_OF_MEMORY, read_outcome
 
 log = logging.getLogger("muster.engines")
 

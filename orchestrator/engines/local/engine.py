@@ -52,7 +52,7 @@ from shared_store.process.ports import first_port, free_port
 from shared_store.process.processes import await_marks, find_process, marked, unkillable
 from shared_store.process.shim import STUCK, exit_code_in, group_of, make_exit_file, shimmed
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import read_outcome
+from shared_store.volume.node_outcomes import read_outcome
 
 log = logging.getLogger("muster.engines")
 

@@ -22,7 +22,7 @@ _STARTING = 40.0
 """Seconds that the watch may take for its first word."""
 
 
-class Watch:
+class ClusterWatch:
     """The state of the cluster, reported periodically by a process that imports Ray."""
 
     def __init__(self, head: str, environment: Mapping[str, str]) -> None:
@@ -60,7 +60,7 @@ class Watch:
             self._process.kill()
 
     def _listen(self) -> None:
-        command = [sys.executable, "-P", "-m", "orchestrator.engines.ray.watch", self.head]
+        command = [sys.executable, "-P", "-m", "orchestrator.engines.ray.cluster_watch", self.head]
         while not self._closing.is_set():
             self._process = subprocess.Popen(
                 command,

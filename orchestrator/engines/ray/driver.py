@@ -25,9 +25,9 @@ from typing import Any
 import ray
 
 from orchestrator.engines.ray import node as ray_node
-from orchestrator.engines.ray.bundles import STRATEGY, bundle_of, selector_of
 from orchestrator.engines.ray.folder import NEW, UNSTARTED, Folder
 from orchestrator.engines.ray.gang import DrivenGang
+from orchestrator.engines.ray.placement_groups import STRATEGY, bundle_of, selector_of
 
 _LINGER = 15.0
 """Seconds for which the place of a gang that is over is kept for the job's next attempt."""

@@ -38,9 +38,9 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.ray import TRAITS
-from orchestrator.engines.ray.bundles import in_words
-from orchestrator.engines.ray.cluster import Watch, address_towards, grows_to, ray_environment
+from orchestrator.engines.ray.cluster import ClusterWatch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray.folder import LEASE, NEW, UNSTARTED, Folder
+from orchestrator.engines.ray.placement_groups import in_words
 from orchestrator.engines.ray.request import GangRequest, NodeRequest
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.looks import one_by_one
@@ -83,7 +83,7 @@ class RayEngine:
             )
         self._grows = grows_to(os.environ.get("MUSTER_RAY_GROWS_TO", ""))
         self._environment = ray_environment(self.head)
-        self._watch = Watch(self.head, self._environment)
+        self._watch = ClusterWatch(self.head, self._environment)
         seen = self._watch.first()
         if "error" in seen:
             raise EngineError(str(seen["error"]))

@@ -14,8 +14,8 @@ from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
 
 from orchestrator.engines.api import Cause
 from orchestrator.engines.ray import node as ray_node
-from orchestrator.engines.ray.bundles import bundle_of
 from orchestrator.engines.ray.folder import LEASE, Folder
+from orchestrator.engines.ray.placement_groups import bundle_of
 from shared_store import __version__
 from shared_store.contract.node import NodeContract
 from shared_store.process.ports import first_port

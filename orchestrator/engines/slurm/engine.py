@@ -40,15 +40,15 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.slurm import TRAITS
-from orchestrator.engines.slurm.commands import (
+from orchestrator.engines.slurm.script import SlurmSubmission, shown, submission_for
+from orchestrator.engines.slurm.slurm_commands import (
     SlurmJob,
-    Unreachable,
+    SlurmUnreachable,
     address_of_this_machine,
     call,
     list_hosts,
     list_jobs,
 )
-from orchestrator.engines.slurm.script import Submission, shown, submission_for
 from orchestrator.engines.slurm.states import CANCELLED, OVER, QUEUED, ending, waiting
 from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.looks import one_by_one
@@ -56,7 +56,7 @@ from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
 from orchestrator.engines.toolkit.stopping import stop_within
 from orchestrator.engines.toolkit.view import CachedView
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import OUT_OF_MEMORY, Outcome
+from shared_store.volume.node_outcomes import OUT_OF_MEMORY, Outcome
 
 _FULL = re.compile(r"MaxSubmit|slurm temporarily unable", re.IGNORECASE)
 """Errors of sbatch after which it would accept the job later."""
@@ -124,13 +124,13 @@ class SlurmEngine:
             raise NotYet(f"Slurm: {trouble}")
         return Queued(hosts)
 
-    def plan(self, gang: Gang) -> Plan[Submission]:
+    def plan(self, gang: Gang) -> Plan[SlurmSubmission]:
         """With the whole script; the nodes' addresses are known when Slurm has placed them."""
         request = submission_for(gang)
         nodes = node_plans(gang, [""] * len(gang.placements), 0)
         return Plan(gang, nodes, request, shown(request.script, gang.bus_token))
 
-    def launch(self, plan: Plan[Submission]) -> Handle:
+    def launch(self, plan: Plan[SlurmSubmission]) -> Handle:
         gang = plan.gang
         facts = {**store_facts(gang), "main": gang.main, "output": plan.request.output}
         patience = 0.0 if self._pending else _PATIENCE
@@ -147,7 +147,7 @@ class SlurmEngine:
         del self._pending[gang.name]
         try:
             return Handle(self.name, gang.name, len(plan.nodes), {**facts, "slurm": pending.result()})
-        except Unreachable as error:
+        except SlurmUnreachable as error:
             raise NotYet(f"Slurm: {error}", unknown=True) from error
 
     def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
@@ -157,7 +157,7 @@ class SlurmEngine:
         facts, count = handle.facts, handle.nodes
         try:
             job = self._job(handle)
-        except Unreachable as error:
+        except SlurmUnreachable as error:
             said = f"Slurm: {error}"
             return [NodeStatus(NodePhase.UNREACHABLE, words=said, stale=said)] * count
         trouble = f"Slurm: {why}" if (why := self._jobs.trouble) else ""
@@ -180,7 +180,7 @@ class SlurmEngine:
         ]
 
     def stop(self, handle: Handle, grace: float) -> None:
-        ending = _Ending(handle.facts["slurm"], grace, self._cancel)
+        ending = _Cancellation(handle.facts["slurm"], grace, self._cancel)
 
         def step() -> str:
             job = self._job(handle, _LOOK if self._interval() <= _OFTEN else _AGAIN)
@@ -217,7 +217,7 @@ class SlurmEngine:
 
     # -- jobs ---------------------------------------------------------------------------------------------------------
 
-    def _begin(self, gang: str, facts: Mapping[str, Any], request: Submission) -> None:
+    def _begin(self, gang: str, facts: Mapping[str, Any], request: SlurmSubmission) -> None:
         """Submit the gang in the background."""
         pending: Future[str] = Future()
 
@@ -244,11 +244,11 @@ class SlurmEngine:
         return None
 
     @staticmethod
-    def _submit(request: Submission) -> str:
+    def _submit(request: SlurmSubmission) -> str:
         Path(request.output).parent.mkdir(parents=True, exist_ok=True)
         try:
             return call("sbatch", "--parsable", text=request.script).strip().partition(";")[0]
-        except Unreachable:
+        except SlurmUnreachable:
             raise
         except EngineError as error:
             if _FULL.search(str(error)):
@@ -271,11 +271,11 @@ class SlurmEngine:
             age = min(age, _OFTEN)
         job = self._jobs.get(age, _ANSWER if self._jobs.taken > submitted else _OVERDUE).get(number)
         if job is None and self._jobs.taken <= submitted:
-            raise Unreachable(self._jobs.trouble or _SILENCE)
+            raise SlurmUnreachable(self._jobs.trouble or _SILENCE)
         return job if job is not None and job.comment == handle.gang else None
 
 
-class _Ending:
+class _Cancellation:
     """The end of one job: asked by a signal, then killed."""
 
     def __init__(self, number: str, grace: float, cancel: Callable[[str], None]) -> None:
@@ -309,7 +309,7 @@ class _Ending:
 def _scancel(*arguments: str) -> None:
     try:
         call("scancel", *arguments)
-    except Unreachable:
+    except SlurmUnreachable:
         raise
     except EngineError:
         pass  # it ended meanwhile

@@ -53,7 +53,7 @@ wait "$step"
 
 
 @dataclass(frozen=True)
-class Submission:
+class SlurmSubmission:
     """A gang's submission to Slurm."""
 
     script: str
@@ -63,9 +63,9 @@ class Submission:
     partition: str | None
 
 
-def submission_for(gang: Gang) -> Submission:
+def submission_for(gang: Gang) -> SlurmSubmission:
     """Raises EngineError as :func:`render` does."""
-    return Submission(render(gang), output_path(gang), gang.options.get("partition"))
+    return SlurmSubmission(render(gang), output_path(gang), gang.options.get("partition"))
 
 
 def shown(script: str, credential: str | None) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from orchestrator.engines.api import Cause
-from orchestrator.engines.slurm.commands import SlurmJob
-from shared_store.volume.outcomes import OUT_OF_MEMORY
+from orchestrator.engines.slurm.slurm_commands import SlurmJob
+from shared_store.volume.node_outcomes import OUT_OF_MEMORY
 
 QUEUED = frozenset(
     {"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "SPECIAL_EXIT", "RESV_DEL_HOLD"}

@@ -15,7 +15,7 @@ from orchestrator.engines.toolkit.looks import observing_several
 from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.files import write_atomic
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import read_outcome
+from shared_store.volume.node_outcomes import read_outcome
 
 _SCRIPT = """
 end="$MUSTER_STORE/ends/$MUSTER_JOB_ID-$AWS_BATCH_JOB_NODE_INDEX"

@@ -11,7 +11,7 @@ from orchestrator.engines.api import Gang, Handle
 from shared_store.contract.node import LOG_LIMIT
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run, Store
-from shared_store.volume.outcomes import Outcome, read_outcome, write_outcome
+from shared_store.volume.node_outcomes import Outcome, read_outcome, write_outcome
 
 
 def store_facts(gang: Gang) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from alembic import context
 
-from orchestrator.persistence.models import Base
+from orchestrator.persistence.batch_models import Base
 from orchestrator.persistence.own_models import KnownAccount  # noqa: F401 (its tables, too)
 
 context.configure(

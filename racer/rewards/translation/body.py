@@ -7,12 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from racer.rewards.translation.calls import Calls
-from racer.rewards.translation.prelude import NO_RESULT
-from racer.rewards.translation.program import Program
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     Constant,
-    Group,
+    ItemList,
     Outside,
     Thing,
     Value,
@@ -24,6 +22,8 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.prelude import NO_RESULT
+from racer.rewards.translation.program import Program
 
 _MOST_PASSES = 16
 _DEEPEST = 20
@@ -329,13 +329,13 @@ def _check_kept(value: Value, node: ast.AST) -> None:
     """Refuse what holds good only where it is written."""
     if isinstance(value, Thing) and value.kind == "iterated":
         raise Outside(node, f"{value.name} that is kept for later")
-    for item in value.items if isinstance(value, Group) else ():
+    for item in value.items if isinstance(value, ItemList) else ():
         _check_kept(item, node)
 
 
 def _sees(value: Value) -> bool:
     """Whether a value is, or holds, a function that sees the variables of the function around it."""
-    if isinstance(value, Group):
+    if isinstance(value, ItemList):
         return any(map(_sees, value.items))
     return isinstance(value, Thing) and value.scope is not None
 

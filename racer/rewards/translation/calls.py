@@ -8,18 +8,14 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME
-from racer.rewards.translation.expressions import Expressions
-from racer.rewards.translation.items import Iterated
-from racer.rewards.translation.mathematics import FUNCTIONS, QUIET
-from racer.rewards.translation.prelude import EMPTY
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     LONGEST_GROUP,
     Constant,
-    Group,
+    ItemList,
     Number,
     Outside,
-    Rows,
+    RuntimeList,
     Thing,
     Value,
     cast,
@@ -32,6 +28,10 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.expressions import Expressions
+from racer.rewards.translation.items import Iterated
+from racer.rewards.translation.mathematics import FUNCTIONS, QUIET
+from racer.rewards.translation.prelude import EMPTY
 from shared_store.contract.error_text import counted
 
 _FOLDS = {"sum": "start", "min": "default", "max": "default", "any": None, "all": None, "len": None}
@@ -131,10 +131,10 @@ class Calls(Expressions):
         parts: Sequence[Value] = arguments
         if name == "math.dist" and len(arguments) == 2:
             one, other = arguments
-            if not (isinstance(one, Group) and isinstance(other, Group) and len(one.items) == len(other.items)):
+            if not (isinstance(one, ItemList) and isinstance(other, ItemList) and len(one.items) == len(other.items)):
                 raise Outside(node, "math.dist() of anything but two points")
             parts = [self.binary(ast.Sub(), *pair, node) for pair in zip(one.items, other.items, strict=True)]
-        elif name == "numpy.linalg.norm" and len(arguments) == 1 and isinstance(arguments[0], Group):
+        elif name == "numpy.linalg.norm" and len(arguments) == 1 and isinstance(arguments[0], ItemList):
             parts = arguments[0].items
         elif name != "math.hypot" and (name != "numpy.hypot" or len(arguments) != 2):
             raise Outside(node, f"{name}() in this form")
@@ -183,7 +183,7 @@ class Calls(Expressions):
 
     def _divmod(self, node: ast.Call, one: Value, other: Value) -> Value:
         one, other = self.hold(one), self.hold(other)
-        return Group((self.binary(ast.FloorDiv(), one, other, node), self.binary(ast.Mod(), one, other, node)))
+        return ItemList((self.binary(ast.FloorDiv(), one, other, node), self.binary(ast.Mod(), one, other, node)))
 
     def _len(self, node: ast.Call, value: Value) -> Value:
         if isinstance(value, Constant) and isinstance(value.value, list | tuple | dict):
@@ -194,7 +194,9 @@ class Calls(Expressions):
     def _list(self, node: ast.Call, value: Value | None = None) -> Value:
         if value is None:
             raise Outside(node, "a list that grows")
-        if isinstance(value, Rows | Group) or (isinstance(value, Constant) and isinstance(value.value, list | tuple)):
+        if isinstance(value, RuntimeList | ItemList) or (
+            isinstance(value, Constant) and isinstance(value.value, list | tuple)
+        ):
             return value
         raise Outside(node, f"a list of {described(shape_of(value))}")
 
@@ -224,7 +226,7 @@ class Calls(Expressions):
         found, first = self.iterated(value, node), number(0) if start is None else self.numeric(start, node)
 
         def item(index: str) -> Value:
-            return Group((Number("int", f"({first.code} + {index})"), found.item(index)))
+            return ItemList((Number("int", f"({first.code} + {index})"), found.item(index)))
 
         return Thing("iterated", "an enumeration", node, Iterated(found.length, item, found.known))
 
@@ -239,7 +241,7 @@ class Calls(Expressions):
             name = self.fresh()
             self.emit(f"const long long {name} = {each.length} < {length} ? {each.length} : {length};")
             length = name
-        scope = Iterated(length, lambda index: Group(tuple(each.item(index) for each in found)), least)
+        scope = Iterated(length, lambda index: ItemList(tuple(each.item(index) for each in found)), least)
         return Thing("iterated", "a zip", node, scope)
 
     def _reversed(self, node: ast.Call, value: Value) -> Value:
@@ -258,7 +260,7 @@ class Calls(Expressions):
     def _extreme(self, name: str, node: ast.Call, *values: Value) -> Value:
         items: tuple[Value, ...] = values
         if len(values) == 1:
-            if not isinstance(values[0], Group):
+            if not isinstance(values[0], ItemList):
                 return self._fold(name, node, lambda use: self.each(values[0], node, use))
             items = values[0].items
         if not items:
@@ -321,8 +323,8 @@ class Calls(Expressions):
             store(target.id, value, target)
         elif isinstance(target, ast.Tuple | ast.List):
             if isinstance(value, Constant) and isinstance(value.value, list | tuple):
-                value = Group(tuple(self.program.wrap(each, target) for each in value.value))
-            if not isinstance(value, Group) or len(value.items) != len(target.elts):
+                value = ItemList(tuple(self.program.wrap(each, target) for each in value.value))
+            if not isinstance(value, ItemList) or len(value.items) != len(target.elts):
                 raise Outside(target, f"{len(target.elts)} names for {described(shape_of(value))}")
             for each, item in zip(target.elts, value.items, strict=True):
                 self.unpack(each, item, store)
@@ -441,4 +443,4 @@ class Calls(Expressions):
             self.unpack(generator.target, self.hold(found.item(str(index))), self._keep)
             items.append(self.hold(self.expression(node.elt)))
             self.overlay.pop()
-        return Group(tuple(items))
+        return ItemList(tuple(items))

@@ -6,9 +6,7 @@ import ast
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-from racer.rewards.translation.prelude import LOOP, UNBOUND
-from racer.rewards.translation.program import Program
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     Number,
     Outside,
@@ -20,6 +18,8 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.prelude import LOOP, UNBOUND
+from racer.rewards.translation.program import Program
 
 BUILTINS = (  # noqa: SIM905
     "abs all any bool divmod enumerate float int len list max min pow print range reversed round sum tuple zip str"

@@ -8,18 +8,15 @@ from functools import partial
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME
-from racer.rewards.translation.items import Items
-from racer.rewards.translation.prelude import KEY
-from racer.rewards.translation.program import CONSTANTS, MODULES, folded
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     LONGEST_GROUP,
     ORDER,
     Constant,
-    Group,
+    ItemList,
     Number,
     Outside,
-    Rows,
+    RuntimeList,
     Thing,
     Value,
     cast,
@@ -32,6 +29,9 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.items import Items
+from racer.rewards.translation.prelude import KEY
+from racer.rewards.translation.program import CONSTANTS, MODULES, folded
 
 _COMPARED = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _WHOLE = {ast.Add: "py_iadd", ast.Sub: "py_isub", ast.Mult: "py_imul", ast.FloorDiv: "py_idiv", ast.Mod: "py_imod"}
@@ -58,7 +58,7 @@ class Expressions(Items):
             raise Outside(node, "a list with a starred item")
         if len(node.elts) > LONGEST_GROUP:
             raise Outside(node, f"a list of more than {LONGEST_GROUP} items that are no constants")
-        return Group(tuple(self.expression(each) for each in node.elts))
+        return ItemList(tuple(self.expression(each) for each in node.elts))
 
     _List = _Tuple
 
@@ -94,8 +94,8 @@ class Expressions(Items):
 
     def binary(self, operation: ast.operator, left: Value, right: Value, node: ast.AST) -> Value:
         """An operation of two numbers."""
-        if isinstance(operation, ast.Add) and isinstance(left, Group) and isinstance(right, Group):
-            return Group((*left.items, *right.items))
+        if isinstance(operation, ast.Add) and isinstance(left, ItemList) and isinstance(right, ItemList):
+            return ItemList((*left.items, *right.items))
         one, other = self.numeric(left, node), self.numeric(right, node)
         if one.constant is not None and other.constant is not None:
             result = folded(operation, one.constant, other.constant)
@@ -148,11 +148,11 @@ class Expressions(Items):
             if value.kind == "text":
                 raise Outside(node, "a text as a condition")
             return value if value.kind == "bool" else Number("bool", f"({value.code} != 0)")
-        if isinstance(value, Group):
+        if isinstance(value, ItemList):
             return number(bool(value.items))
         if isinstance(value, Constant):
             return number(bool(value.value))
-        if isinstance(value, Rows):
+        if isinstance(value, RuntimeList):
             return Number("bool", f"({value.length} > 0)")
         return number(True)
 
@@ -244,7 +244,7 @@ class Expressions(Items):
             if not (isinstance(one, Number) and isinstance(other, Number) and one.kind == other.kind == "bool"):
                 raise Outside(node, "is with anything but None, True or False")
             operation = ast.Eq()
-        if isinstance(operation, ast.Eq) and isinstance(one, Group) and isinstance(other, Group):
+        if isinstance(operation, ast.Eq) and isinstance(one, ItemList) and isinstance(other, ItemList):
             if len(one.items) != len(other.items):
                 return number(False)
             parts = [self.compared(operation, *pair, node) for pair in zip(one.items, other.items, strict=True)]
@@ -265,9 +265,9 @@ class Expressions(Items):
         if isinstance(other, Thing) and other.kind == "params" and isinstance(one, Number) and one.kind == "text":
             return number(one.constant in BY_NAME)
         if isinstance(other, Constant) and isinstance(other.value, dict):
-            other = Group(tuple(self.program.wrap(key, node) for key in other.value))
+            other = ItemList(tuple(self.program.wrap(key, node) for key in other.value))
         held = self.hold(one)
-        if isinstance(other, Group):
+        if isinstance(other, ItemList):
             parts = [self.compared(ast.Eq(), held, item, node).code for item in other.items]
             return Number("bool", f"({' || '.join(parts) or 'false'})")
         found = self.fresh()

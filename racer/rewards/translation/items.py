@@ -8,13 +8,13 @@ from dataclasses import dataclass
 
 from racer.rewards.parameters import BY_NAME
 from racer.rewards.translation.emitter import Emitting
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     Constant,
-    Group,
+    ItemList,
     Number,
     Outside,
-    Rows,
+    RuntimeList,
     Thing,
     Value,
     cast,
@@ -69,13 +69,13 @@ class Items(Emitting):
             if known is not None and -len(base.value) <= known < len(base.value):
                 return self.program.wrap(base.value[known], node)
             return self._cells(base, f"py_index({cast(index, 'int')}, {len(base.value)}, {self.at(node)})", node)
-        if isinstance(base, Group):
+        if isinstance(base, ItemList):
             if known is not None and -len(base.items) <= known < len(base.items):
                 return base.items[known]
             place = self.fresh()
             self.emit(f"const long long {place} = py_index({cast(index, 'int')}, {len(base.items)}, {self.at(node)});")
             return self.chosen(base.items, place, node)
-        if isinstance(base, Rows):
+        if isinstance(base, RuntimeList):
             place = self.fresh()
             self.emit(f"const long long {place} = py_index({cast(index, 'int')}, {base.length}, {self.at(node)});")
             return base.row(place)
@@ -116,7 +116,7 @@ class Items(Emitting):
             Number(kind, f"({C_TYPES[kind]}){name}[{len(kinds)} * {place} + {column}]")
             for column, kind in enumerate(kinds)
         )
-        return Group(cells) if isinstance(base.value[0], list | tuple) else cells[0]
+        return ItemList(cells) if isinstance(base.value[0], list | tuple) else cells[0]
 
     def _slice(self, base: Value, node: ast.Subscript) -> Value:
         assert isinstance(node.slice, ast.Slice)
@@ -126,8 +126,8 @@ class Items(Emitting):
             if value is not None and (not isinstance(value, Number) or not isinstance(value.constant, int)):
                 raise Outside(node, "a slice whose bounds are not known")
             bounds.append(None if value is None else value.constant)
-        if isinstance(base, Group):
-            return Group(base.items[slice(*bounds)])
+        if isinstance(base, ItemList):
+            return ItemList(base.items[slice(*bounds)])
         if isinstance(base, Constant) and isinstance(base.value, list | tuple) and bounds[2] != 0:
             return self.program.wrap(base.value[slice(*bounds)], node)
         raise Outside(node, f"a slice of {described(shape_of(base))}")
@@ -137,15 +137,15 @@ class Items(Emitting):
     def iterated(self, value: Value, node: ast.AST) -> Iterated:
         """The items of a loop."""
         if isinstance(value, Constant) and isinstance(value.value, dict):
-            value = Group(tuple(self.program.wrap(key, node) for key in value.value))
-        if isinstance(value, Group):
+            value = ItemList(tuple(self.program.wrap(key, node) for key in value.value))
+        if isinstance(value, ItemList):
             held = self.hold(value)
-            assert isinstance(held, Group)
+            assert isinstance(held, ItemList)
             return Iterated(str(len(held.items)), lambda index: self.chosen(held.items, index, node), len(held.items))
         if isinstance(value, Constant) and isinstance(value.value, list | tuple):
             constant = value
             return Iterated(str(len(value.value)), lambda index: self._cells(constant, index, node), len(value.value))
-        if isinstance(value, Rows):
+        if isinstance(value, RuntimeList):
             return Iterated(value.length, value.row)
         if isinstance(value, Thing) and isinstance(value.scope, Iterated):
             return value.scope

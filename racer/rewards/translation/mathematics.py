@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from racer.rewards.translation.values import Number
+from racer.rewards.translation.expression_values import Number
 
 
 @dataclass(frozen=True)

@@ -9,14 +9,14 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME, NUMBER_COLUMNS, OBJECT_COLUMNS, OBJECT_COUNT
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     LONGEST_GROUP,
     Constant,
-    Group,
+    ItemList,
     Number,
     Outside,
-    Rows,
+    RuntimeList,
     Thing,
     Value,
     number,
@@ -125,7 +125,7 @@ class Program:
             except OverflowError as error:
                 raise Outside(node, str(error)) from error
         if isinstance(value, list | tuple) and _count(value) <= LONGEST_GROUP:
-            return Group(tuple(self.wrap(item, node) for item in value))
+            return ItemList(tuple(self.wrap(item, node) for item in value))
         if value is None or isinstance(value, list | tuple | dict):
             return Constant(value, self._constants.setdefault(repr(value), f"c{len(self._constants)}"))
         raise Outside(node, f"a constant of type {type(value).__name__}")
@@ -137,16 +137,18 @@ class Program:
         if found.shape == "one":
             return Number(found.kind, f"p_{name}")
         if found.shape == "two":
-            return Group((Number("int", f"p_{name}_0"), Number("int", f"p_{name}_1")))
+            return ItemList((Number("int", f"p_{name}_0"), Number("int", f"p_{name}_1")))
         if found.shape == "waypoints":
-            return Rows(name, "count_waypoints", _point("py_waypoint({}, 0)", "py_waypoint({}, 1)"))
+            return RuntimeList(name, "count_waypoints", _point("py_waypoint({}, 0)", "py_waypoint({}, 1)"))
         first = OBJECT_COLUMNS[name]
         if found.points:
-            return Rows(name, "count_objects", _point(f"py_object({{}}, {first})", f"py_object({{}}, {first + 1})"))
+            return RuntimeList(
+                name, "count_objects", _point(f"py_object({{}}, {first})", f"py_object({{}}, {first + 1})")
+            )
         code = f"py_object({{}}, {first})"
         if found.kind == "bool":
-            return Rows(name, "count_objects", lambda index: Number("bool", f"({code.format(index)} != 0.0)"))
-        return Rows(name, "count_objects", lambda index: Number("float", code.format(index)))
+            return RuntimeList(name, "count_objects", lambda index: Number("bool", f"({code.format(index)} != 0.0)"))
+        return RuntimeList(name, "count_objects", lambda index: Number("float", code.format(index)))
 
     def prologue(self) -> list[str]:
         """C++ lines that read the keys that are used."""
@@ -236,7 +238,7 @@ class Program:
             names = target.elts if isinstance(target, ast.Tuple | ast.List) else [target]
             parts = (
                 value.items
-                if isinstance(target, ast.Tuple) and isinstance(value, Group) and len(value.items) == len(names)
+                if isinstance(target, ast.Tuple) and isinstance(value, ItemList) and len(value.items) == len(names)
                 else [value] * len(names)
             )
             for name, part in zip(names, parts, strict=True):
@@ -283,7 +285,7 @@ class Program:
                 return known.value
             if isinstance(known, Number) and known.constant is not None:
                 return known.constant
-            if isinstance(known, Group):
+            if isinstance(known, ItemList):
                 return _plain(known)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and len(node.args) == 1:
             module = self.names.get(node.func.value.id) if isinstance(node.func.value, ast.Name) else None
@@ -317,7 +319,7 @@ def _check_harmless(statement: ast.stmt) -> None:
 
 
 def _plain(value: Value) -> Any:
-    if isinstance(value, Group):
+    if isinstance(value, ItemList):
         return [_plain(item) for item in value.items]
     assert isinstance(value, Number)  # the groups of a module hold nothing else
     return value.constant
@@ -331,4 +333,4 @@ def _count(value: Any) -> int:
 
 
 def _point(x: str, y: str) -> Any:
-    return lambda index: Group((Number("float", x.format(index)), Number("float", y.format(index))))
+    return lambda index: ItemList((Number("float", x.format(index)), Number("float", y.format(index))))

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from racer.rewards.parameters import TRACK
 from racer.rewards.problems import LARGEST_REWARD, out_of_range
 from racer.rewards.translation.body import Body
+from racer.rewards.translation.expression_values import C_TYPES, Outside, Thing, described
 from racer.rewards.translation.prelude import BEYOND, ERRORS, MOST_ROUNDS, NOT_FINITE, used
 from racer.rewards.translation.program import Program
-from racer.rewards.translation.values import C_TYPES, Outside, Thing, described
 
 
 @dataclass(frozen=True)

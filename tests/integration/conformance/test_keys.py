@@ -26,7 +26,7 @@ from orchestrator.api.http.limits import RateLimit
 from orchestrator.api.http.requests import actor_of
 from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
-from orchestrator.persistence.models import JobQueue
+from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from tests.conftest import PATIENCE, Serving, call_muster, run_muster, wait_for

@@ -10,7 +10,7 @@ from typing import Any, cast
 import pytest
 
 from orchestrator.console import job_view
-from orchestrator.console.job_view import State, Views
+from orchestrator.console.job_view import JobViewState, Views
 from orchestrator.domain.errors import ApiError, ClientError
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.logs import format_line
@@ -330,20 +330,20 @@ def test_the_page_of_an_array_leads_to_its_jobs(console: Console, store: Store) 
 
 
 OPEN = "import time; print('note: 2 worlds'); print('the view is at http://127.0.0.1:9', flush=True); time.sleep(600)"
-SHOWN = State(url="http://127.0.0.1:9")
+SHOWN = JobViewState(url="http://127.0.0.1:9")
 
 
 def script(text: str) -> list[str]:
     return [sys.executable, "-c", text]
 
 
-def shown(views: Views, job: str, state: State) -> None:
+def shown(views: Views, job: str, state: JobViewState) -> None:
     wait_for(lambda: views.state(job) == state, 20, f"{job}: {state}")
 
 
 def test_a_view_is_open_until_it_is_closed_and_a_server_has_two_at_once() -> None:
     views = Views()
-    assert views.state("a") == State()
+    assert views.state("a") == JobViewState()
     views.start("a", script(OPEN))
     views.start("b", script(OPEN))
     assert views.state("a").text == "starting"
@@ -354,20 +354,20 @@ def test_a_view_is_open_until_it_is_closed_and_a_server_has_two_at_once() -> Non
     with pytest.raises(ClientError, match="2 live views are open on this server; close one first"):
         views.start("c", script(OPEN))
     views.end("a")
-    shown(views, "a", State())
+    shown(views, "a", JobViewState())
     views.start("c", script(OPEN))
     shown(views, "c", SHOWN)
     for job in ("b", "c", "nobody's"):
         views.end(job)
-        shown(views, job, State())
+        shown(views, job, JobViewState())
 
 
 def test_the_reason_of_a_view_that_ends_is_its_last_line() -> None:
     views = Views()
     views.start("a", script("print('muster: the training is on another machine'); raise SystemExit(1)"))
-    shown(views, "a", State(problem="the training is on another machine"))
+    shown(views, "a", JobViewState(problem="the training is on another machine"))
     views.start("a", script("raise SystemExit(3)"))
-    shown(views, "a", State(problem="exit code 3"))
+    shown(views, "a", JobViewState(problem="exit code 3"))
 
 
 def test_a_view_ends_when_nobody_looks_at_its_page(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -375,7 +375,7 @@ def test_a_view_ends_when_nobody_looks_at_its_page(monkeypatch: pytest.MonkeyPat
     views = Views()
     views.start("a", script(OPEN))
     wait_for(lambda: views.state("a", is_seen=True) == SHOWN, 20, "the view")
-    shown(views, "a", State())
+    shown(views, "a", JobViewState())
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from orchestrator.domain.hosts import Limit, Placement, Queued
 from orchestrator.domain.resources import Resources
 from orchestrator.engines.aws_batch.config import load_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
-from orchestrator.engines.aws_batch.stack import Event, first_failure
+from orchestrator.engines.aws_batch.stack import StackEvent, first_failure
 from tests.conftest import REPOSITORY, call_muster
 from tests.support.engines.bench import make_gang
 
@@ -372,8 +372,8 @@ def test_down_asks_first_removes_the_stack_and_says_that_the_volume_stays(tmp_pa
 
 
 def test_the_resource_that_failed_first_is_named_not_those_that_it_took_along() -> None:
-    def event(resource: str, status: str, reason: str = "") -> Event:
-        return Event("12:00:00", resource, f"AWS::EC2::{resource}", status, reason)
+    def event(resource: str, status: str, reason: str = "") -> StackEvent:
+        return StackEvent("12:00:00", resource, f"AWS::EC2::{resource}", status, reason)
 
     events = [
         event("Vpc", "CREATE_COMPLETE"),

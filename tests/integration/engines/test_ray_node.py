@@ -15,7 +15,7 @@ from shared_store.process.processes import end_all, find_process
 from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
 from shared_store.volume.log_view import LogView
-from shared_store.volume.outcomes import read_outcome
+from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import wait_for
 from tests.support.processes import alive, await_end, frozen
 

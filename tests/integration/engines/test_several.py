@@ -16,11 +16,11 @@ import pytest
 from orchestrator.domain.errors import ApiError
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.ray.cluster import ray_environment
-from orchestrator.engines.slurm import commands as slurm_commands
+from orchestrator.engines.slurm import slurm_commands
 from orchestrator.engines.toolkit.mounts import Mount, with_mounts
 from shared_store.volume.layout import Store
 from shared_store.volume.metrics import read_metrics
-from shared_store.volume.outcomes import read_outcome
+from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import Serving, call_muster, wait_for
 from tests.support.engines.images import PATH, PLAIN, SUPERVISED, host_files, plain
 from tests.support.engines.sites import POLITE, WAIT, Site

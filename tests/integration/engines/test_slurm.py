@@ -13,10 +13,10 @@ import pytest
 
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Cause, EngineError, Handle, NodeStatus, NotYet
-from orchestrator.engines.slurm import commands as slurm_commands
 from orchestrator.engines.slurm import script as slurm_script
-from orchestrator.engines.slurm.commands import SlurmJob, list_hosts
+from orchestrator.engines.slurm import slurm_commands
 from orchestrator.engines.slurm.engine import SlurmEngine
+from orchestrator.engines.slurm.slurm_commands import SlurmJob, list_hosts
 from orchestrator.engines.slurm.states import ending, waiting
 from orchestrator.engines.toolkit.looks import status_of
 from tests.conftest import Serving, wait_for

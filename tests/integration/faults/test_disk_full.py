@@ -14,7 +14,7 @@ from sqlalchemy import func, select, update
 
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
 from orchestrator.domain.errors import ApiError
-from orchestrator.persistence.models import JobQueue
+from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.persistence.session import Database, DatabaseFull
 from shared_store.volume.layout import Store
 from shared_store.volume.metrics import MetricsWriter, read_metrics

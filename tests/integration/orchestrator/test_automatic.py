@@ -15,7 +15,7 @@ from sqlalchemy import select
 
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.server import Server
 from orchestrator.services import automatic_evaluations as automatic
 from orchestrator.services import submission

@@ -12,8 +12,8 @@ import pytest
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import Cause
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import ComputeEnvironment, Job
-from shared_store.volume.outcomes import Outcome, write_outcome
+from orchestrator.persistence.batch_models import ComputeEnvironment, Job
+from shared_store.volume.node_outcomes import Outcome, write_outcome
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.waiting import wait_for
 

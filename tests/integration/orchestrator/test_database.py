@@ -22,7 +22,7 @@ from orchestrator.control.usage import add_usage, charge, resource_seconds, usag
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.domain.errors import ApiError, RequestError, ServerError, UsageError
 from orchestrator.persistence.access_keys import KeyStore, KeyUsageError
-from orchestrator.persistence.models import (
+from orchestrator.persistence.batch_models import (
     Attempt,
     Base,
     ComputeEnvironment,

@@ -12,12 +12,12 @@ from sqlalchemy import select
 
 from orchestrator.control.attempts import Attempts
 from orchestrator.control.exposition import exposition
-from orchestrator.domain.attempt import State
+from orchestrator.domain.attempt import AttemptState
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import Gang, Handle, NotYet, Plan
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job, JobQueue
+from orchestrator.persistence.batch_models import Job, JobQueue
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.waiting import wait_for
 
@@ -56,7 +56,7 @@ def stop(bench: Bench, name: str) -> None:
 
 def test_nothing_of_an_attempt_stays_in_memory_once_its_job_has_ended_or_it_was_withdrawn(bench: Bench) -> None:
     gc.collect()
-    before = {id(each) for each in gc.get_objects() if isinstance(each, State | Handle)}
+    before = {id(each) for each in gc.get_objects() if isinstance(each, AttemptState | Handle)}
     bench.runs_and_ends("a", "b")
     bench.submit("stopped")
     bench.wait("stopped", Status.RUNNING)
@@ -67,9 +67,9 @@ def test_nothing_of_an_attempt_stays_in_memory_once_its_job_has_ended_or_it_was_
     stop(bench, "waits")
     attempts: Attempts = bench.controller.attempts
 
-    def kept() -> list[State | Handle]:
+    def kept() -> list[AttemptState | Handle]:
         gc.collect()
-        return [each for each in gc.get_objects() if isinstance(each, State | Handle) and id(each) not in before]
+        return [each for each in gc.get_objects() if isinstance(each, AttemptState | Handle) and id(each) not in before]
 
     wait_for(lambda: not kept() and not attempts._open, 10, "that nothing is kept")
 

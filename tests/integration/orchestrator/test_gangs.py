@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.api.batch import rules
+from orchestrator.api.batch import validation
 from orchestrator.console.job_facts import facts_of
 from orchestrator.console.jobs import _row as jobs_page_row
 from orchestrator.domain import attempt
@@ -204,7 +204,7 @@ def test_the_nodes_of_a_job_are_read_once_whoever_needs_them(tmp_path: Path, mon
         read.append(node_properties["numNodes"])
         return gang_needs(node_properties)
 
-    for module in (rules, gangs, continuing):
+    for module in (validation, gangs, continuing):
         monkeypatch.setattr(module, "gang_needs", counting)
     spec = validate({"name": "say", "command": ["echo", "here"], "resources": {"cpus": 0.1, "memory": 64}}, "job.yaml")
     with serving(tmp_path) as client:

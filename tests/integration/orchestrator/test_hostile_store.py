@@ -11,9 +11,9 @@ import httpx
 import pytest
 from sqlalchemy import select
 
-from orchestrator.api.logs.events import log_file
+from orchestrator.api.logs.log_events import log_file
 from orchestrator.client import Client
-from orchestrator.persistence.models import Job, JobQueue
+from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
 from shared_store.volume.epoch import close_claim, raise_epoch, read_epoch
@@ -22,7 +22,7 @@ from shared_store.volume.layout import Run
 from shared_store.volume.log_files import LogWriter
 from shared_store.volume.log_view import LogView
 from shared_store.volume.logs import format_line
-from shared_store.volume.outcomes import Outcome, read_outcome, write_outcome
+from shared_store.volume.node_outcomes import Outcome, read_outcome, write_outcome
 from tests.conftest import call_muster, submit_gang, wait_for
 from tests.support.definitions import nodes_of
 

@@ -17,7 +17,7 @@ import pytest
 from sqlalchemy import create_engine, select, text
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.persistence.models import Attempt, Job, JobQueue, Node
+from orchestrator.persistence.batch_models import Attempt, Job, JobQueue, Node
 from orchestrator.persistence.session import Database
 from shared_store.volume.epoch import Claim, take_epoch
 from shared_store.volume.layout import Store

@@ -19,7 +19,7 @@ from sqlalchemy import update
 from orchestrator.control import attempts
 from orchestrator.control.attempts import Attempts
 from orchestrator.control.exposition import exposition
-from orchestrator.domain.attempt import Phase, State, after, step
+from orchestrator.domain.attempt import AttemptPhase, AttemptState, after, step
 from orchestrator.domain.attempt_events import Event
 from orchestrator.domain.attempt_instructions import Instructions
 from orchestrator.domain.hosts import Host, Hosts
@@ -37,7 +37,7 @@ from orchestrator.engines.api import (
     Plan,
 )
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import DatabaseError
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.orchestrator.rows import job
@@ -219,12 +219,12 @@ def test_a_row_that_says_nothing_of_a_gang_that_runs_keeps_no_other_job_from_sta
 
 
 def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    left: dict[int, State] = {}
+    left: dict[int, AttemptState] = {}
     """By number of the attempt."""
-    found: list[tuple[State, State]] = []
-    phases: set[Phase] = set()
+    found: list[tuple[AttemptState, AttemptState]] = []
+    phases: set[AttemptPhase] = set()
 
-    def recorded(state: State, event: Event) -> Instructions:
+    def recorded(state: AttemptState, event: Event) -> Instructions:
         number, instructions = state.terms.number, step(state, event)
         phases.add(state.phase)
         if number in left:  # a request may have asked the job to end meanwhile
@@ -262,7 +262,7 @@ def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, mo
             job = session.get_one(Job, "job")
             ends = [(each.ending, each.status_reason, each.exit_code, each.spent) for each in job.attempts]
     assert ends == [("failed", "node 1: exit 3, outcome not written", 3, True), ("stopped", "enough", None, True)]
-    assert phases == set(Phase) - {Phase.CLOSED}
+    assert phases == set(AttemptPhase) - {AttemptPhase.CLOSED}
     assert all(left[number].closed for number in (1, 2))
     for expected, state in found:
         assert state == expected

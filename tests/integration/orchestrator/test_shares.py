@@ -11,7 +11,7 @@ import pytest
 
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.server import Server
 from orchestrator.services import derived_jobs
 from tests.support.definitions import container, multinode

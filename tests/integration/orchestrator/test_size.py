@@ -12,7 +12,7 @@ from sqlalchemy import event, func, select
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.api.logs.streams import newest_streams
 from orchestrator.domain.errors import ClientError
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from orchestrator.services.context import Context

@@ -27,7 +27,7 @@ from orchestrator.engines.api import Handle
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.home import HomeLock
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
 from shared_store.volume import epoch, files

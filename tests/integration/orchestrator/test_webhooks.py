@@ -18,7 +18,7 @@ from sqlalchemy import select
 
 from orchestrator.client import Client
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.own_models import WebhookDelivery
 from orchestrator.server import Server
 from tests.conftest import Serving, submit_gang

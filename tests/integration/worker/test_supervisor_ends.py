@@ -15,7 +15,7 @@ import pytest
 from shared_store.contract.faults import Fault
 from shared_store.contract.node import sealed
 from shared_store.volume.epoch import raise_epoch
-from shared_store.volume.outcomes import LONGEST_TEXT
+from shared_store.volume.node_outcomes import LONGEST_TEXT
 from tests.conftest import PATIENCE, wait_for
 from tests.support.faults.full_disk import full_volume
 from tests.support.faults.outages import loop_volume

@@ -100,13 +100,13 @@ def one_of_two() -> int:
     """A rank: three iterations on the point task with worlds of its own; what came of it is the last line of its output."""
     import os
 
-    from worker.learning.algorithm import Share
-    from worker.learning.distributed import Placement, connect
+    from worker.learning.algorithm import WorldShare
+    from worker.learning.distributed import RankPlacement, connect
     from worker.learning.randomness import seed_generators
 
-    gang = connect(Placement.from_env(os.environ))
+    gang = connect(RankPlacement.from_env(os.environ))
     algorithm_type = find_algorithm(OWN)
-    share = Share.of(gang.rank, gang.size, 5)
+    share = WorldShare.of(gang.rank, gang.size, 5)
     task = Point(PointConfig(), share.count, seed=2, first_world=share.first)
     seed_generators(1, gang.rank)  # other weights on each rank, were they not shared
     algorithm = algorithm_type(algorithm_type.config_type(), setting_of(task, gang=gang, share=share))

@@ -17,7 +17,7 @@ from tests.support.worker.loop import groups
 from tests.support.worker.rsl_loop import GAUSSIAN, Recall, build, evaluate, train
 from tests.support.worker.rsl_loop import GRU as SMALL_GRU
 from worker.learning.rsl.algorithm import RslRl
-from worker.learning.rsl.environment import TaskVecEnv, make
+from worker.learning.rsl.vector_environment import TaskVecEnv, make
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 
 torch.set_num_threads(1)

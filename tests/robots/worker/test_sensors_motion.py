@@ -12,7 +12,7 @@ from tests.support.worker.sensing import Reference, scene, step, walker
 from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.imu import Imu
 from worker.simulation.sensors.momentum import AngularMomentum
-from worker.simulation.sensors.sensor import Declaration, SensorContext
+from worker.simulation.sensors.sensor import SensorContext, SensorDeclaration
 
 CONTROLS = np.array([[0.3, -0.4], [-0.5, 1.5]], np.float32)
 """Torques of the walker's legs in two worlds."""
@@ -224,7 +224,7 @@ def walking() -> SensorContext:
     ],
 )
 def test_a_sensor_that_can_t_be_built_is_refused_in_one_line(
-    walking: SensorContext, declared: Declaration, parts: list[Any]
+    walking: SensorContext, declared: SensorDeclaration, parts: list[Any]
 ) -> None:
     said = refusal(declared.build, walking)
     assert all(part in said for part in parts), said

@@ -8,7 +8,7 @@ import numpy as np
 from worker.settings.task import TaskConfig
 from worker.simulation.robot import Robot
 from worker.tasks.run.task import Task
-from worker.telemetry.picture import Camera
+from worker.telemetry.picture import StageCamera
 from worker.telemetry.stage import Stage
 
 TWO_JOINTS = """<mujoco><worldbody><body name="hip" pos="0 0 1">
@@ -32,5 +32,5 @@ def test_a_body_of_two_joints_is_one_link() -> None:
     half = np.sqrt(0.5)
     np.testing.assert_allclose(poses[0, 0], [0.0, 0.0, 1.0, 0.0, 0.0, half, half], atol=1e-6)
     np.testing.assert_allclose(poses[1, :, 2], [2.0, 2.5], atol=1e-6)  # it turned about a point 0.5 m above it
-    image = Camera(stage, 64, 48).take(np.zeros((2, 3)))
+    image = StageCamera(stage, 64, 48).take(np.zeros((2, 3)))
     assert image.shape[-1] == 3 and image.std() > 0.0

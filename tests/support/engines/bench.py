@@ -14,7 +14,7 @@ from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.layout import Store
 from shared_store.volume.log_view import LogView
 from shared_store.volume.logs import LogLine
-from shared_store.volume.outcomes import Outcome, read_outcome
+from shared_store.volume.node_outcomes import Outcome, read_outcome
 from tests.support.engines.sites import WAIT
 from tests.support.processes import processes_of
 from tests.support.waiting import wait_for

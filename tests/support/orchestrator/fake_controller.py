@@ -14,10 +14,10 @@ from orchestrator.control.run_store import RunStore
 from orchestrator.domain.job import Status
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job, JobQueue
+from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.persistence.session import Database
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import Outcome, write_outcome
+from shared_store.volume.node_outcomes import Outcome, write_outcome
 from tests.support.orchestrator.rows import job
 from tests.support.waiting import wait_for
 

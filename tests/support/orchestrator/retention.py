@@ -13,10 +13,10 @@ from sqlalchemy import func, select, update
 
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention
-from orchestrator.control.retention_looks import CONTROLLER, Place, Step, Whose
+from orchestrator.control.retention_looks import CONTROLLER, PassCursor, Step, Whose
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS
-from orchestrator.persistence.models import Attempt, Base, Dependency, Job, Node, RunRecord, now
+from orchestrator.persistence.batch_models import Attempt, Base, Dependency, Job, Node, RunRecord, now
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.session import Database
 from shared_store.volume.files import write_json
@@ -51,7 +51,7 @@ class World:
         )
 
     def step(
-        self, after: Place = Place(), *, take: bool, whose: Whose = CONTROLLER, most: int = 100, **rules: Any
+        self, after: PassCursor = PassCursor(), *, take: bool, whose: Whose = CONTROLLER, most: int = 100, **rules: Any
     ) -> Step:
         """A step, with other rules."""
         retention = self.retention()

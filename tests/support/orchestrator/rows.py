@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from tests.support.definitions import nodes_of
 
 NODES = nodes_of({"command": ["true"]}, 2)

@@ -14,7 +14,7 @@ from orchestrator.scheduling.snapshot import (
     FairShare,
     Leading,
     Queue,
-    Running,
+    RunningGang,
     Snapshot,
     TimeLimit,
     Waiting,
@@ -74,11 +74,11 @@ def running(
     timeout: int | None = None,
     preemptible: bool = False,
     ending: bool = False,
-) -> Running:
+) -> RunningGang:
     """A gang; ``for_seconds``: None while it starts."""
     since = None if for_seconds is None else NOW - 1000 * for_seconds
     job = f"{name}-0123456789"
-    return Running(job, name, queue, share, priority, environment, placements, since, timeout, preemptible, ending)
+    return RunningGang(job, name, queue, share, priority, environment, placements, since, timeout, preemptible, ending)
 
 
 def on(name: str, cpus: float = 0, gpus: Iterable[int] = (), memory: int = 0) -> Placement:
@@ -108,7 +108,7 @@ class Pass:
         self,
         hosts: Sequence[Host],
         waiting: Sequence[Waiting] = (),
-        held: Sequence[Running] = (),
+        held: Sequence[RunningGang] = (),
         queues: Sequence[Queue] = (),
         environments: Sequence[ComputeEnvironment] = (),
         usage: Mapping[tuple[str, str], float] | None = None,

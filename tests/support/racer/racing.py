@@ -10,7 +10,7 @@ import torch
 from racer.car.task import Racer
 from racer.settings.task import RacerConfig
 from racer.tracks.presets import make_preset
-from racer.tracks.track import Track
+from racer.tracks.race_track import Track
 
 OVAL = make_preset("oval")
 

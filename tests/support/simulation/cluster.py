@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from orchestrator.engines.api import Gang
 from shared_store.contract.faults import Fault
-from shared_store.volume.outcomes import EX_TEMPFAIL, FirstError, Outcome
+from shared_store.volume.node_outcomes import EX_TEMPFAIL, FirstError, Outcome
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation

@@ -13,8 +13,8 @@ from sqlalchemy import Dialect, Engine, StaticPool, create_engine, make_url
 from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import ensure_compute_environments
+from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.persistence.job_counts import JobCounts
-from orchestrator.persistence.models import JobQueue
 from orchestrator.persistence.session import Database, DatabaseError, _read_document
 from tests.support.simulation.machine import LoopWaits
 

@@ -7,7 +7,7 @@ from functools import cache
 from random import Random
 from typing import Any
 
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
 

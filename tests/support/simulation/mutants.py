@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 from unittest import mock
 
-from orchestrator.control import attempts, endings
+from orchestrator.control import attempts, node_ends
 from orchestrator.control.observer import Observer
 from orchestrator.control.presence import Presence
 from orchestrator.control.run_store import Errands, RunStore
@@ -76,8 +76,8 @@ def what_is_to_end_is_launched() -> Mutant:
     """B9: a gang that is preempted before its launch is launched all the same."""
     step = rules.step
 
-    def stepped(state: rules.State, event: Event) -> Instructions:
-        if state.phase is rules.Phase.LAUNCHING and state.verdict is not None:
+    def stepped(state: rules.AttemptState, event: Event) -> Instructions:
+        if state.phase is rules.AttemptPhase.LAUNCHING and state.verdict is not None:
             if isinstance(event, Due):
                 return (Launch(),)
             if isinstance(event, LaunchDelayed):
@@ -91,7 +91,7 @@ def a_launched_gang_waits_for_its_look() -> Mutant:
     """A gang is launched, and nobody looks at it until the next look at an attempt for which nothing is due."""
     step = rules.step
 
-    def stepped(state: rules.State, event: Event) -> Instructions:
+    def stepped(state: rules.AttemptState, event: Event) -> Instructions:
         done = step(state, event)
         return done[:-1] if isinstance(event, Launched) and done else done
 
@@ -121,20 +121,20 @@ def any_volume_is_the_store() -> Mutant:
 
 def without_an_outcome_is_killed() -> Mutant:
     """T2: a node that ended with 0 and could not write its outcome counts as killed."""
-    seen_end = endings.seen_end
+    seen_end = node_ends.seen_end
 
     def seen(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
         end = seen_end(node, is_native, moment)
         return replace(end, exit_code=end.exit_code or 137) if node.cause is Cause.EXIT else end
 
-    return mock.patch.object(endings, "seen_end", seen)
+    return mock.patch.object(node_ends, "seen_end", seen)
 
 
 def a_fault_is_forgotten() -> Mutant:
     """The same fault is tried as often as the job has attempts."""
     step = rules.step
 
-    def stepped(state: rules.State, event: Event) -> Instructions:
+    def stepped(state: rules.AttemptState, event: Event) -> Instructions:
         return step(replace(state, terms=replace(state.terms, last_fault=None)), event)
 
     return mock.patch.object(attempts, "step", stepped)

@@ -13,7 +13,7 @@ from typing import Any
 from orchestrator import machine as seam
 from orchestrator.control.controller import Controller
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import DatabaseError
 from tests.support.simulation.bus import SimulatedBus

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from orchestrator.control.run_store import Progress, RunFacts, RunStore
+from orchestrator.control.run_store import ObservedRun, RunContent, RunStore
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import Outcome
+from shared_store.volume.node_outcomes import Outcome
 
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
@@ -91,11 +91,11 @@ class SimulatedRunStore(RunStore):
         while self._world.volume.stalled:
             self._world.machine.sleep(1.0)
 
-    def examine(self, name: str) -> RunFacts:
-        def body() -> RunFacts:
+    def examine(self, name: str) -> ObservedRun:
+        def body() -> ObservedRun:
             self._wait()
             run = self._world.volume.read(name)
-            return RunFacts(name, run.description is None, run.description, epoch=run.epoch)
+            return ObservedRun(name, run.description is None, run.description, epoch=run.epoch)
 
         return self._call(f"read run {name}", body)
 
@@ -119,11 +119,11 @@ class SimulatedRunStore(RunStore):
 
         return self._call("read outcomes", body)
 
-    def progress(self, name: str, epoch: int) -> Progress:
-        def body() -> Progress:
+    def progress(self, name: str, epoch: int) -> RunContent:
+        def body() -> RunContent:
             self._wait()
             run = self._world.volume.read(name)
-            return Progress(run.iteration, run.saved.get(epoch))
+            return RunContent(run.iteration, run.saved.get(epoch))
 
         return self._call(f"read the checkpoints of run {name}", body)
 

@@ -28,13 +28,13 @@ def compile_for(name: str) -> None:
     import warp
 
     from worker.learning.algorithms import find_algorithm, installed
-    from worker.learning.distributed import Gang, Placement, warm_marker
+    from worker.learning.distributed import Gang, RankPlacement, warm_marker
     from worker.learning.setup import load_kernels
     from worker.tasks import find_task
 
     warp.config.log_level = warp.LOG_WARNING
     for algorithm in installed():
-        load_kernels(find_algorithm(algorithm), Gang(Placement(), "cpu", None, ["here"]))
+        load_kernels(find_algorithm(algorithm), Gang(RankPlacement(), "cpu", None, ["here"]))
     task = find_task(name)
     task(task.config_type(), 2, seed=1)
     marker = warm_marker(task, "cpu")

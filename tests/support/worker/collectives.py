@@ -205,7 +205,9 @@ TESTS = {
         "a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read": {"learning/state.py": "TrainingState.restore"},
         "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/adoption.py": "adopt"},
         "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/teacher.py": "_learnt give_teacher"},
-        "worlds_that_do_not_fit_are_refused_by_all_ranks": {"learning/memory.py": "_taken measure within_memory"},
+        "worlds_that_do_not_fit_are_refused_by_all_ranks": {
+            "learning/memory_estimate.py": "_taken measure within_memory"
+        },
         "worlds_drawn_at_random_are_built_anew_for_the_evaluation": {
             "evaluation/final_evaluation.py": "held_out_worlds"
         },

@@ -24,7 +24,7 @@ from tests.support.worker.collectives import watching
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import run_ranks
 from worker.learning import distributed
-from worker.learning.distributed import Gang, Placement
+from worker.learning.distributed import Gang, RankPlacement
 from worker.learning.randomness import seed_generators
 
 Case = Callable[[Gang, Path], Any]
@@ -59,7 +59,7 @@ def play() -> int:
     torch.set_num_threads(1)
     distributed.COLLECTIVE_SECONDS = SECONDS * PATIENCE
     with watching() as seen:
-        gang = distributed.connect(Placement.from_env(os.environ))
+        gang = distributed.connect(RankPlacement.from_env(os.environ))
         for function in importlib.import_module(os.environ["CASES"]).CASES:
             seed_generators(1, gang.rank)
             told: dict[str, Any] = {}

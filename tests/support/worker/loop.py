@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 
-from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces, Transition
-from worker.learning.distributed import Gang, Placement
+from worker.learning.algorithm import Algorithm, LearningSetting, Policy, Spaces, Transition, WorldShare
+from worker.learning.distributed import Gang, RankPlacement
 
 
 def alone(device: str = "cpu") -> Gang:
     """A gang of one."""
-    return Gang(Placement(), device, None, ["here"])
+    return Gang(RankPlacement(), device, None, ["here"])
 
 
 def groups(task: Any, terminal: bool = False) -> TensorDict:
@@ -29,10 +29,10 @@ def spaces_of(task: Any) -> Spaces:
     return Spaces({name: tuple(group.shape[1:]) for name, group in groups(task).items()}, task.action_size)
 
 
-def setting_of(task: Any, seed: int = 0, gang: Gang | None = None, share: Share | None = None) -> Setting:
+def setting_of(task: Any, seed: int = 0, gang: Gang | None = None, share: WorldShare | None = None) -> LearningSetting:
     """Where an algorithm learns that has all the task's worlds, or ``share``."""
-    every = Share(0, task.world_count, task.world_count)
-    return Setting(spaces_of(task), share or every, gang or alone(), seed)
+    every = WorldShare(0, task.world_count, task.world_count)
+    return LearningSetting(spaces_of(task), share or every, gang or alone(), seed)
 
 
 def transition_of(task: Any) -> Transition:

@@ -13,7 +13,7 @@ from shared_store.contract.node import NodeContract
 from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.log_view import LogView
-from shared_store.volume.outcomes import Outcome, read_outcome
+from shared_store.volume.node_outcomes import Outcome, read_outcome
 from tests.support.waiting import PATIENCE, wait_for
 
 ENVIRONMENT = {

@@ -82,7 +82,7 @@ def train() -> int:
     """What ``worker.train`` does, with the test double as the task."""
     from tests.support.worker.point_task import TASK
     from worker.learning import leaving
-    from worker.learning.distributed import Placement, connect, use_cpu_threads
+    from worker.learning.distributed import RankPlacement, connect, use_cpu_threads
     from worker.learning.job import Job, StopRequest
     from worker.learning.loop import Loop
     from worker.learning.training import Training
@@ -91,7 +91,9 @@ def train() -> int:
     stop = StopRequest().listen()
     job = Job.from_env(os.environ, "train")
     use_cpu_threads(os.environ)
-    gang = connect(Placement.from_env(os.environ), report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS", "60")))
+    gang = connect(
+        RankPlacement.from_env(os.environ), report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS", "60"))
+    )
     code = leaving.train(Loop(Training.of(job, TASK), gang, stop, hooks()), stop)
     gang.close()
     return code

@@ -15,7 +15,7 @@ from torch import nn
 from tests.support.worker.loop import groups, setting_of, transition_of
 from tests.support.worker.point_task import Point, PointConfig
 from worker.learning import algorithms
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import WorldShare
 from worker.learning.distributed import Gang
 from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.rsl.algorithm import RslRl
@@ -56,7 +56,7 @@ def settings(section: dict[str, Any]) -> RslRlConfig:
     return read
 
 
-def build(task: Any, section: dict[str, Any], gang: Gang | None = None, share: Share | None = None) -> RslRl:
+def build(task: Any, section: dict[str, Any], gang: Gang | None = None, share: WorldShare | None = None) -> RslRl:
     """The algorithm that a job's ``rsl_rl`` section describes, for ``task``."""
     setting = setting_of(task, 1, gang, share)
     return RslRl(settings(section), dataclasses.replace(setting, control_seconds=1.0 / task.config.control_hz))

@@ -9,7 +9,7 @@ import torch
 
 from tests.support.worker.loop import setting_of
 from tests.support.worker.point_task import Point, PointConfig
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import WorldShare
 from worker.learning.distributed import Gang
 from worker.learning.sac.sac import SAC
 from worker.settings.sac import SACConfig
@@ -30,7 +30,7 @@ SMALL = SACConfig(
 )
 
 
-def make(task: Any, seed: int = 1, gang: Gang | None = None, share: Share | None = None, **settings: Any) -> SAC:
+def make(task: Any, seed: int = 1, gang: Gang | None = None, share: WorldShare | None = None, **settings: Any) -> SAC:
     torch.manual_seed(5)
     return SAC(dataclasses.replace(SMALL, **settings), setting_of(task, seed, gang, share))
 

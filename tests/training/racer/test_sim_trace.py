@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from orchestrator.cli.evaluations import _copy
 from racer.car.sim_trace import SIM_TRACE_COLUMNS
 from racer.car.task import Racer
 from racer.car.training_trace import CARS as MOST_CARS
+from racer.control.evaluate_options import _copy
 from racer.race.trials import Laps
 from racer.settings.task import RacerConfig
 from racer.store.races import race_changes, rules_of

@@ -21,7 +21,7 @@ from tests.support.worker.ranks import placement, training
 from tests.support.worker.runs import runner, train
 from worker import export, repeat_incident
 from worker.settings.errors import TrainingError, UserError
-from worker.telemetry.view import Policy
+from worker.telemetry.live_view import PolicyView
 
 CHANGE = (
     "robot: mass [kg] 1.1 became 1.3; body pole: mass 0.1 became 0.3; "
@@ -60,9 +60,9 @@ def change(file: Path) -> None:
 def test_a_view_of_the_policy_needs_its_consent(trained: Run, capsys: pytest.CaptureFixture[str]) -> None:
     name = list_checkpoints(trained)[-1].name
     with pytest.raises(UserError) as refused:
-        Policy(trained, {"checkpoint": None, "accept_changed_robot": False}, 1, 1, [])
+        PolicyView(trained, {"checkpoint": None, "accept_changed_robot": False}, 1, 1, [])
     assert str(refused.value) == f"checkpoint {name} {OTHER}{ACCEPT}"
-    Policy(trained, {"checkpoint": None, "accept_changed_robot": True}, 1, 1, [])
+    PolicyView(trained, {"checkpoint": None, "accept_changed_robot": True}, 1, 1, [])
     assert f"warning: checkpoint {name} {OTHER}\n" in capsys.readouterr().out
 
 
@@ -71,7 +71,7 @@ def test_what_follows_from_an_accepted_robot_does_not_refuse_the_policy(
 ) -> None:
     train(job(tmp_path), task=Changing)
     file.write_text(file.read_text().replace('gear="10"', 'gear="8"'))
-    Policy(Store(tmp_path).run("run"), {"checkpoint": None, "accept_changed_robot": True}, 1, 1, [])
+    PolicyView(Store(tmp_path).run("run"), {"checkpoint": None, "accept_changed_robot": True}, 1, 1, [])
     printed = capsys.readouterr().out
     assert "actuator slider: gear 10 became 8" in printed and "action 0: slider scale 10.0 became 8.0" in printed
 

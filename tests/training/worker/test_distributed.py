@@ -20,8 +20,8 @@ from tests.conftest import PATIENCE
 from tests.support.worker.loop import iterate, setting_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
-from worker.learning.algorithm import Share
-from worker.learning.distributed import Gang, Placement, _listen, connect, require_gpus, warm_marker
+from worker.learning.algorithm import WorldShare
+from worker.learning.distributed import Gang, RankPlacement, _listen, connect, require_gpus, warm_marker
 from worker.learning.ppo.fused import PPO
 from worker.settings.errors import GangError
 
@@ -31,7 +31,7 @@ WORLDS = 7  # two ranks get 3 and 4
 def learn() -> int:
     """Body of a rank: saves what it computed to ``MUSTER_OUT``."""
     torch.set_num_threads(1)
-    gang = connect(Placement.from_env(os.environ))
+    gang = connect(RankPlacement.from_env(os.environ))
     torch.save(compute(gang), f"{os.environ['MUSTER_OUT']}.{gang.rank}")
     gang.close()
     return 0
@@ -39,7 +39,7 @@ def learn() -> int:
 
 def compute(gang: Gang) -> list[dict[str, torch.Tensor]]:
     """Three iterations, each of several passes over several minibatches."""
-    share = Share.of(gang.rank, gang.size, WORLDS)
+    share = WorldShare.of(gang.rank, gang.size, WORLDS)
     config = PointPPO(epochs=3, minibatches=4)
     task = Point(PointConfig(ppo=config), share.count, seed=2, first_world=share.first)
     task.set_random_episode_length()
@@ -65,7 +65,7 @@ def compute(gang: Gang) -> list[dict[str, torch.Tensor]]:
 def learnt(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], list[dict[str, torch.Tensor]]]:
     """What each rank of a gang of one and of a gang of two computed, by (ranks, rank)."""
     folder = tmp_path_factory.mktemp("learnt")
-    found = {(1, 0): compute(connect(Placement(), device="cpu"))}
+    found = {(1, 0): compute(connect(RankPlacement(), device="cpu"))}
     for code, _, errors in run_ranks("training.worker.test_distributed:learn", 2, {"MUSTER_OUT": str(folder / "two")}):
         assert code == 0, errors
     return found | {(2, rank): torch.load(folder / f"two.{rank}", weights_only=True) for rank in (0, 1)}
@@ -101,12 +101,12 @@ def test_a_missing_rank_is_named_by_all() -> None:
 
 def report() -> int:
     """Body of a rank that only forms the gang."""
-    connect(Placement.from_env(os.environ), report_seconds=float(os.environ["MUSTER_REPORT_SECONDS"]))
+    connect(RankPlacement.from_env(os.environ), report_seconds=float(os.environ["MUSTER_REPORT_SECONDS"]))
     return 0
 
 
 def test_a_missing_main_rank_is_named() -> None:
-    placement = Placement(rank=1, world_size=2, master_port=free_port())
+    placement = RankPlacement(rank=1, world_size=2, master_port=free_port())
     said = r"rank 1 \(node 1\) could not reach rank 0 \(node 0\) at 127.0.0.1:\d+ within 1 s"
     with pytest.raises(GangError, match=said):
         connect(placement, report_seconds=1.0)
@@ -125,7 +125,7 @@ def test_ranks_whose_main_rank_ends_at_the_resume_say_so_in_one_line(tmp_path: P
 
 def end_while_building() -> int:
     """Body of a rank: the main rank exits during its build, while the other one waits for it."""
-    gang = connect(Placement.from_env(os.environ))
+    gang = connect(RankPlacement.from_env(os.environ))
     with gang.build_in_turn():
         if gang.is_main:
             os._exit(1)
@@ -183,7 +183,7 @@ def build(warm: Path | None, sites: list[str], is_taken_in_turn: bool) -> list[t
     meeting = threading.Barrier(1 if is_taken_in_turn else 2)
 
     def rank(number: int) -> None:
-        gang = Gang(Placement(rank=number, world_size=2), "cpu", store, sites)
+        gang = Gang(RankPlacement(rank=number, world_size=2), "cpu", store, sites)
         with gang.build_in_turn(warm):
             events.append(("start", number))
             time.sleep(0.1)  # in which one that does not wait would come, too
@@ -216,7 +216,7 @@ def test_the_warm_marker_depends_on_the_task_and_lives_in_the_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path))
-    first, second = warm_marker(Gang, "cpu"), warm_marker(Placement, "cpu")
+    first, second = warm_marker(Gang, "cpu"), warm_marker(RankPlacement, "cpu")
     assert first and second and first != second and first.parent.parent == tmp_path
     monkeypatch.delenv("WARP_CACHE_PATH")
     assert warm_marker(Gang, "cpu") is None
@@ -231,7 +231,7 @@ def test_the_warm_marker_depends_on_the_task_and_lives_in_the_cache(
 )
 def test_a_malformed_placement_is_refused(env: dict[str, str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        Placement.from_env(env)
+        RankPlacement.from_env(env)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="this PyTorch can use a GPU")

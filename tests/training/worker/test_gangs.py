@@ -23,7 +23,7 @@ from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from tests.support.worker.sac import make
 from worker.evaluation.episodes import play
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import WorldShare
 from worker.learning.distributed import Gang
 from worker.learning.job import Job, StopRequest
 from worker.learning.plain_ppo import PlainPPO
@@ -132,7 +132,7 @@ class Still:
 
 @case
 def episodes_are_played_until_the_last_one_of_any_rank_has_ended(gang: Gang, store: Path) -> Any:
-    share = Share.of(gang.rank, gang.size, WORLDS)
+    share = WorldShare.of(gang.rank, gang.size, WORLDS)
     fallen, standing = (PointConfig(episode_seconds=5.0, limit=limit) for limit in (0.0, 3.0))
     rounds = (fallen if gang.rank else standing, fallen)
     tasks = [Point(config, share.count, seed=2, first_world=share.first) for config in rounds]
@@ -253,7 +253,7 @@ def worlds_that_do_not_fit_are_refused_by_all_ranks(gang: Gang, store: Path) -> 
 
     env = training(store, run="large", worlds=10**6)
     with given(gang, env), pytest.MonkeyPatch.context() as patch:
-        patch.setattr("worker.learning.memory.free_bytes", lambda _: 10**6)
+        patch.setattr("worker.learning.memory_estimate.free_bytes", lambda _: 10**6)
         train.main()
 
 
@@ -264,11 +264,11 @@ def test_worlds_that_do_not_fit_are_refused_by_all_ranks(told: list[Any]) -> Non
 
 @case
 def worlds_that_turn_out_not_to_fit_are_measured_by_all_ranks(gang: Gang, store: Path) -> Any:
-    from worker.learning import memory
+    from worker.learning import memory_estimate
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(memory, "free_bytes", lambda _: 10**6)
-        with memory.within_memory(Point, PointConfig(), (PPO, PointPPO()), 4, gang):  # type: ignore[arg-type]
+        patch.setattr(memory_estimate, "free_bytes", lambda _: 10**6)
+        with memory_estimate.within_memory(Point, PointConfig(), (PPO, PointPPO()), 4, gang):  # type: ignore[arg-type]
             raise MemoryError
 
 
@@ -367,8 +367,8 @@ def test_start_frames_follow_the_failures_of_all_ranks(told: list[Any]) -> None:
 # -- algorithms -------------------------------------------------------------------------------------------------------
 
 
-def dealt(gang: Gang) -> tuple[Point, Share]:
-    share = Share.of(gang.rank, gang.size, WORLDS)
+def dealt(gang: Gang) -> tuple[Point, WorldShare]:
+    share = WorldShare.of(gang.rank, gang.size, WORLDS)
     return Point(PointConfig(), share.count, seed=2, first_world=share.first), share
 
 
@@ -417,7 +417,7 @@ def rsl_rl_has_the_same_weights_normalizers_and_metrics_on_all_ranks(gang: Gang,
 
     found = {}
     for name, section in rsl_loop.SECTIONS.items():
-        share = Share.of(gang.rank, gang.size, WORLDS)
+        share = WorldShare.of(gang.rank, gang.size, WORLDS)
         task = rsl_loop.GroupedPoint(PointConfig(), share.count, seed=3, first_world=share.first)
         seed_generators(1, gang.rank)  # other weights on each rank, were they not shared
         algorithm = rsl_loop.build(task, {"num_steps_per_env": 8, **section}, gang, share)

@@ -11,7 +11,7 @@ from PIL import Image
 
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.picture import Camera, Glance, encode, pace, strip
+from worker.telemetry.picture import Glance, StageCamera, encode, pace, strip
 from worker.telemetry.stage import Stage
 
 torch.set_num_threads(1)
@@ -19,8 +19,8 @@ CONFIG = CartpoleConfig(episode_seconds=0.2)
 
 
 @pytest.fixture(scope="module")
-def camera() -> Camera:
-    return Camera(Stage(Cartpole, CONFIG, 2), 160, 60)
+def camera() -> StageCamera:
+    return StageCamera(Stage(Cartpole, CONFIG, 2), 160, 60)
 
 
 def orange(image: np.ndarray) -> np.ndarray:
@@ -35,7 +35,7 @@ def blue(image: np.ndarray) -> np.ndarray:
     return (other > green + 40) & (green > red + 15)
 
 
-def test_each_world_is_in_its_tile_upright_and_leaning_as_it_leans(camera: Camera) -> None:
+def test_each_world_is_in_its_tile_upright_and_leaning_as_it_leans(camera: StageCamera) -> None:
     picture = camera.take(np.array([[0.0, 0.0], [0.0, 0.9]], np.float32))
     assert picture.shape == (60, 160, 3)
     for tile, leans in ((picture[:, :80], False), (picture[:, 80:], True)):
@@ -46,7 +46,7 @@ def test_each_world_is_in_its_tile_upright_and_leaning_as_it_leans(camera: Camer
         assert (width > height / 2) == leans
 
 
-def test_the_camera_follows_the_robot(camera: Camera) -> None:
+def test_the_camera_follows_the_robot(camera: StageCamera) -> None:
     camera.take(np.zeros((2, 2), np.float32))
     far = camera.take(np.array([[1.5, 0.0], [-1.5, 0.0]], np.float32))
     for tile in (far[:, :80], far[:, 80:]):

@@ -20,12 +20,12 @@ from shared_store.volume.layout import Run
 from worker.learning.reporter import Gate
 from worker.settings.overrides import configured
 from worker.tasks.library.cartpole_pixels import CartpolePixels
-from worker.telemetry.live import record
+from worker.telemetry.live_recording import record
 from worker.telemetry.live_tap import Attending
+from worker.telemetry.live_view import TrainingView
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
-from worker.telemetry.tap import Reading, Tap
-from worker.telemetry.view import Training
+from worker.telemetry.tap import Tap, TapReader
 
 torch.set_num_threads(1)
 CONFIG = {"episode_seconds": 0.2, "camera": {"width": 12, "height": 8}}
@@ -114,7 +114,7 @@ def test_the_live_view_of_a_training_shows_them_beside_each_other(running: Runni
     from rerun.chunk import RrdReader
 
     stop: list[int] = []
-    view = Training(running.run, "job", 2, stop, Activity())
+    view = TrainingView(running.run, "job", 2, stop, Activity())
     view.show(lambda: File(tmp_path / "view.rrd", stop))
     assert view.frames > 3
     shown: list[np.ndarray] = []
@@ -141,7 +141,7 @@ def test_images_that_are_too_large_are_left_out_and_one_line_says_so(
     assert (tap.layout.rows, tap.layout.images) == (1024, ())
     assert tap.left_out.startswith("images are left out: of 2 worlds they take 0.0 MB in each control step")
     tap.open()
-    reading = Reading(tap)
+    reading = TapReader(tap)
     task.step(torch.zeros(3, 1))
     rows = reading.take()
     assert len(rows) == 1 and rows.images is None and rows.pictures(0) == {}

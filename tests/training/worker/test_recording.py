@@ -26,12 +26,12 @@ from tests.support.worker.in_process import call_worker
 from worker.settings.cartpole import CartpoleConfig
 from worker.settings.errors import UserError
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.live import main
+from worker.telemetry.live_recording import main
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
 from worker.telemetry.rows import Rows
 from worker.telemetry.stage import Stage
-from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.tap import Tap, TapReader
 
 torch.set_num_threads(1)
 REPOSITORY = Path(__file__).parents[3]
@@ -47,7 +47,7 @@ class Recorded:
         task, self.stage = Cartpole(CONFIG, 2, seed=3), Stage(Cartpole, CONFIG, 2)
         tap = Tap(task, 2, rows=64)
         tap.open()
-        reading = Reading(tap)
+        reading = TapReader(tap)
         image = np.zeros((1, 2, 3, 8, 16), np.uint8)
         image[0, 1, :, 2, 5] = (255, 128, 0)
         recording = Recording(path, self.stage, {"run": "taught", "seed": "3"}, {"job.json": b"{}"})
@@ -189,7 +189,7 @@ def record_for_ever(path: Path) -> None:
     task = Cartpole(CONFIG, 2, seed=3)
     tap = Tap(task, 2)
     tap.open()
-    reading = Reading(tap)
+    reading = TapReader(tap)
     recording = Recording(path, Stage(Cartpole, CONFIG, 2), {}, {})
     while True:
         task.step(torch.zeros(2, 1))

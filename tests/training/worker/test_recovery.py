@@ -14,7 +14,7 @@ from tests.support.worker.in_process import call_worker
 from tests.training.worker.test_recording import Recorded
 from worker.settings.errors import UserError
 from worker.telemetry.intact_records import CHANNELS
-from worker.telemetry.live import main
+from worker.telemetry.live_recording import main
 from worker.telemetry.recording import Recording
 from worker.telemetry.recovering import recover
 from worker.telemetry.replay import Replay

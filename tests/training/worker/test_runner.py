@@ -27,7 +27,7 @@ from tests.support.worker.ranks import run_ranks, training
 from tests.support.worker.runs import assert_same_bits, last, runner, train
 from worker.learning import algorithms
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.distributed import Placement
+from worker.learning.distributed import RankPlacement
 from worker.learning.job import StopRequest, configure
 from worker.learning.loop import Loop
 from worker.learning.ppo.fused import PPO
@@ -64,7 +64,7 @@ def resume_in_a_gang() -> int:
     from worker.learning.distributed import connect
 
     torch.set_num_threads(1)
-    gang = connect(Placement.from_env(os.environ))
+    gang = connect(RankPlacement.from_env(os.environ))
     store = Path(os.environ["MUSTER_STORE"])
     for settings in (
         {"run": "straight", "iterations": 6},

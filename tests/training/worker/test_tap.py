@@ -21,7 +21,7 @@ from worker.tasks.library.cartpole import Cartpole
 from worker.telemetry.live_tap import Attending
 from worker.telemetry.rows import MARKS, Layout, Rows
 from worker.telemetry.segment import Segment
-from worker.telemetry.tap import Reading, Tap
+from worker.telemetry.tap import Tap, TapReader
 from worker.telemetry.tap_request import answer_of, request_of
 
 torch.set_num_threads(1)
@@ -38,10 +38,10 @@ def drawn(step: int, worlds: int = 6) -> torch.Tensor:
     return torch.rand(worlds, 1, generator=torch.Generator().manual_seed(step)) * 2.0 - 1.0
 
 
-def opened(task: Cartpole, worlds: int) -> tuple[Tap, Reading]:
+def opened(task: Cartpole, worlds: int) -> tuple[Tap, TapReader]:
     tap = Tap(task, worlds, rows=16)
     tap.open()
-    return tap, Reading(tap)
+    return tap, TapReader(tap)
 
 
 def test_a_row_holds_the_result_of_the_step(task: Cartpole) -> None:

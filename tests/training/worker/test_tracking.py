@@ -33,7 +33,7 @@ TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 40, "seed": 5, "config"
 
 PATIENT = f"""
 import runpy
-from worker.telemetry import tracking
+from worker.telemetry import tracking_processes
 tracking.READY_SECONDS *= {PATIENCE}
 tracking.FAREWELL["finished"] *= {PATIENCE}
 runpy.run_module("worker.train", run_name="__main__")

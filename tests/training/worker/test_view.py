@@ -18,7 +18,7 @@ from PIL import Image
 from tests.support.refusals import refusal
 from tests.training.worker.test_recording import STEPS, Recorded
 from worker.settings.errors import UserError
-from worker.telemetry.page import Page
+from worker.telemetry.page import ViewerPage
 from worker.telemetry.replay import Replay
 from worker.telemetry.screen import Screen
 
@@ -124,7 +124,7 @@ def test_camera_images_are_shown_as_one_picture_of_all_worlds(recorded: Recorded
 
 
 def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:
-    with Page(None, "64MB") as page:
+    with ViewerPage(None, "64MB") as page:
         with urllib.request.urlopen(f"{page.url}/") as answer:
             policy, text = answer.headers["Content-Security-Policy"], answer.read().decode()
         assert "connect-src 'self' blob: data:" in policy
@@ -136,7 +136,7 @@ def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:
             assert error.value.code == code
         port = int(page.url.rpartition(":")[2])
         with pytest.raises(UserError, match=f"--port {port}: the page can't be served there"):
-            Page(port, "64MB")
+            ViewerPage(port, "64MB")
         page._process.kill()
         page._process.wait()
         with pytest.raises(UserError, match=r"the viewer's server ended \(signal 9\)"):
@@ -146,7 +146,7 @@ def test_the_page_is_for_this_machine_alone_and_reaches_no_other() -> None:
 
 def test_the_stream_comes_through_the_port_of_the_page_also_at_a_tunnel_s_other_end() -> None:
     """As the viewer in a browser asks for it, by gRPC-web, and finds an address of this page alone."""
-    with Page(None, "64MB") as page:
+    with ViewerPage(None, "64MB") as page:
         stream = rerun.RecordingStream("tunnel")
         stream.connect_grpc(page.server)
         stream.log("number", rerun.Scalars(1.0))
@@ -179,4 +179,4 @@ def test_the_stream_comes_through_the_port_of_the_page_also_at_a_tunnel_s_other_
 def test_without_the_extra_one_line_names_the_installation(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("worker.telemetry.page.find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"pip install 'muster\[viz\]'"):
-        Page(None, "64MB")
+        ViewerPage(None, "64MB")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from racer.car.bicycle import Motion, drive
+from racer.car.bicycle import CarMotion, drive
 from racer.car.car_arrays import overlap
 from racer.tracks import road
 from racer.tracks.arithmetic import sine_cosine
@@ -16,7 +16,7 @@ from racer.tracks.circuit import GAP, bounds, side_by_side
 from racer.tracks.generator import make_random
 from racer.tracks.geometry import advance, degrees, on_road, place_at, project
 from racer.tracks.presets import make_preset
-from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
+from racer.tracks.race_track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 from tests.support.racer.racing import open_track
 
 
@@ -205,7 +205,7 @@ def _place(
 
 
 @wp.kernel
-def _drive(starts: wp.array[Motion], asked: wp.array[wp.vec2], lags: wp.vec2, ends: wp.array[Motion]):
+def _drive(starts: wp.array[CarMotion], asked: wp.array[wp.vec2], lags: wp.vec2, ends: wp.array[CarMotion]):
     car = wp.tid()
     motion = starts[car]
     for _ in range(15):
@@ -311,9 +311,9 @@ def test_the_car_moves_as_a_bicycle_that_is_integrated_by_hand() -> None:
     asked = np.array([[4.0, 0.5236], [1.0, -0.3], [0.5, 0.1], [2.0, -0.5236]])
     starts = np.array([[0, 0, 0, 0, 0], [1, 2, -1, 3, 0.4], [0.3, -1, 2, 0.1, 0], [0, 0, 3, 4, 0.5]], float)
     lags = (0.2, 0.05)
-    rows = np.array([tuple(row) for row in starts], dtype=Motion.numpy_dtype())
-    motions = wp.array(rows, dtype=Motion)
-    ends = wp.zeros(4, dtype=Motion)
+    rows = np.array([tuple(row) for row in starts], dtype=CarMotion.numpy_dtype())
+    motions = wp.array(rows, dtype=CarMotion)
+    ends = wp.zeros(4, dtype=CarMotion)
     wp.launch(_drive, dim=4, inputs=[motions, wp.array(asked, dtype=wp.vec2), wp.vec2(*lags)], outputs=[ends])
     for start, (speed, steering), end in zip(starts, asked, ends.numpy(), strict=True):
         expected = by_hand(start, speed, steering, lags, 1.0)
@@ -321,7 +321,7 @@ def test_the_car_moves_as_a_bicycle_that_is_integrated_by_hand() -> None:
 
 
 def test_without_lag_the_car_drives_the_circle_of_its_steering_at_once() -> None:
-    motions, ends = wp.zeros(1, dtype=Motion), wp.zeros(1, dtype=Motion)
+    motions, ends = wp.zeros(1, dtype=CarMotion), wp.zeros(1, dtype=CarMotion)
     asked = wp.array([[1.0, 0.4]], dtype=wp.vec2)
     wp.launch(_drive, dim=1, inputs=[motions, asked, wp.vec2(0.0, 0.0)], outputs=[ends])
     x, y, heading, *_ = ends.numpy()[0]

@@ -22,8 +22,8 @@ from racer.tracks.circuit import circuit_of
 from racer.tracks.geometry import advance, on_road, place_at, project
 from racer.tracks.naming import keep
 from racer.tracks.picture import picture_of
+from racer.tracks.race_track import Track
 from racer.tracks.route_file import from_bytes, to_bytes
-from racer.tracks.track import Track
 from shared_store.volume.layout import Store
 from tests.support.racer.racing import OVAL, known, open_track, straight
 from tests.support.refusals import refusal

@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from racer.car.resets import COUNTS
 from racer.car.task import Racer, RacerPixels
 from racer.car.trace import COLUMNS
-from racer.race.trials import SIM_TRACE_COLUMNS, Laps, Race
+from racer.race.trials import SIM_TRACE_COLUMNS, Laps, RaceTrials
 from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
 from racer.store.races import race_changes, rules_of
 from racer.tracks.geometry import place_at, project
@@ -47,7 +47,7 @@ class Driver:
         """It remembers nothing."""
 
 
-def drive(gain: float = 1.0, learns: bool = False, **section: Any) -> tuple[Racer, Episodes, Race]:
+def drive(gain: float = 1.0, learns: bool = False, **section: Any) -> tuple[Racer, Episodes, RaceTrials]:
     """The race that a job with this ``race`` section is, of a driver that goes as told."""
     changes = race_changes({"track": "oval", **section})
     task = Racer(configured(RacerConfig, {"track": "chicane", **changes}), section.get("trials", 3), seed=5)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from racer.store.races import clock, key_of, race_changes, rules_of
-from racer.store.standings import BadRace, Contender, Race, Ranking, differences, read_race, table
+from racer.store.standings import BadRace, Contender, RaceResults, Ranking, differences, read_race, table
 from shared_store.volume.evaluations import lines
 from tests.support.racer.leagues import race
 
@@ -69,7 +69,7 @@ def test_a_race_is_printed_as_a_table_of_its_trials() -> None:
 def contender(entry: int, times: list[int], racer: str = "", laps: int = 3, **facts: Any) -> Contender:
     """``times`` in milliseconds."""
     counts = {key: facts.pop(key, 0) for key in ("resets", "off_tracks", "crashes")}
-    driven = Race(laps, tuple(time / 1000 for time in times), **counts)
+    driven = RaceResults(laps, tuple(time / 1000 for time in times), **counts)
     return Contender(entry, racer or f"r{entry}", f"m@{entry}", driven, **facts)
 
 
@@ -85,13 +85,13 @@ def contender(entry: int, times: list[int], racer: str = "", laps: int = 3, **fa
 def test_total_requires_every_lap_and_other_rankings_use_complete_ones(
     times: list[int], total: int | None, best: int | None, average: int | None
 ) -> None:
-    driven = Race(3, tuple(time / 1000 for time in times), 0, 0, 0)
+    driven = RaceResults(3, tuple(time / 1000 for time in times), 0, 0, 0)
     assert [driven.counts(ranking) for ranking in ("total", "best", "average")] == [total, best, average]
 
 
 def test_a_race_is_read_with_its_penalties_and_its_times_are_equal_to_the_millisecond() -> None:
     driven = read_race(race([14.3404, 12.2, None], off_tracks=2, resets=2))
-    assert driven == Race(laps=3, times=(14.3404, 12.2), resets=2, off_tracks=2, crashes=0)
+    assert driven == RaceResults(laps=3, times=(14.3404, 12.2), resets=2, off_tracks=2, crashes=0)
     earlier, later = (read_race(race([time], off_tracks=0)) for time in (12.3404, 12.3396))
     rows = table([Contender(1, "a", "m@1", earlier), Contender(2, "b", "m@2", later)], "total")
     assert [(row.rank, row.racer, row.time) for row in rows] == [(1, "a", 12.34), (2, "b", 12.34)]

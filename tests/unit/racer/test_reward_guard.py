@@ -12,7 +12,7 @@ from racer.rewards.__main__ import main
 from racer.rewards.guard import check, check_source
 from racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of, table
 from racer.rewards.problems import KINDS
-from racer.rewards.samples import Line, oval, samples
+from racer.rewards.samples import CentreLine, oval, samples
 from racer.rewards.translation import translate
 from tests.conftest import REPOSITORY
 from tests.support.racer.racing import round_the_guard
@@ -298,7 +298,7 @@ def test_the_command_reports_errors_or_the_mode_of_execution(
 
 
 def test_the_samples_are_what_a_car_on_the_oval_sees() -> None:
-    line, found = Line(oval()), samples()
+    line, found = CentreLine(oval()), samples()
     assert line.points[0] == line.points[-1] and abs(line.length - (8.0 + 3.2 * 3.14159)) < 0.02
     straight = found["straight"]
     # 1.5 m along the lower straight, which begins at (-2, -1.6); 0.21 m to the left of it; turned by 8 degrees to the right

@@ -6,7 +6,7 @@ import pytest
 
 from orchestrator.console.forms import Form
 from orchestrator.console.submit_fields import document, filled, groups, written
-from orchestrator.console.submit_help import Problem, help_at, problem_of
+from orchestrator.console.submit_help import SubmissionProblem, help_at, problem_of
 from orchestrator.spec import strict_yaml
 
 CODES = ("def f():\n    return 1\n", "# ½ 😀\n\n\n\tx = 'a: b'\n", "  indented\nless\n", "trailing \n\n", "one line")
@@ -51,6 +51,6 @@ def test_help_is_of_the_section_in_which_the_line_stands(line: int) -> None:
 def test_an_error_has_its_key_its_line_and_that_of_its_code() -> None:
     code = "reward_function.py:2: FORBIDDEN: open can't be used"
     found = problem_of(f"job.yaml:8: train.config.reward_function: {code}", JOB)
-    assert found == Problem(code, "train.config.reward_function", 12, 2)
+    assert found == SubmissionProblem(code, "train.config.reward_function", 12, 2)
     inline = JOB.replace("text: |", 'text: "')
     assert problem_of(f"job.yaml:8: train.config.reward_function: {code}", inline).line == 8

@@ -22,8 +22,8 @@ from racer.tracks.geometry import on_road
 from racer.tracks.naming import keep, resolve
 from racer.tracks.picture import picture_of
 from racer.tracks.presets import PRESETS, make_preset
+from racer.tracks.race_track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 from racer.tracks.route_file import from_bytes, read_file, to_bytes
-from racer.tracks.track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 

@@ -20,9 +20,9 @@ from racer.tracks.generator import make_random
 from racer.tracks.geometry import advance, on_road, place_at, project
 from racer.tracks.naming import keep, resolve
 from racer.tracks.presets import PRESETS, make_preset
+from racer.tracks.race_track import Track
 from racer.tracks.road import road_arrays
 from racer.tracks.route_file import from_bytes, to_bytes
-from racer.tracks.track import Track
 from shared_store.volume.layout import Store
 from tests.support.racer.racing import known
 

@@ -20,7 +20,7 @@ from tests.support.refusals import refusal
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import Point, PointConfig
 from worker.learning import algorithms
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import WorldShare
 from worker.learning.algorithms import (
     check_actions,
     check_metrics,
@@ -99,7 +99,7 @@ def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
 def test_attributes_set_in_the_constructor_are_checked_before_the_first_iteration() -> None:
     chosen = find_algorithm(f"{HERE}:Forgetful")
     with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is no algorithm: it lacks steps \("):
-        build_algorithm(chosen, None, Point(PointConfig(), 2), Share(0, 2, 2), alone(), 0)
+        build_algorithm(chosen, None, Point(PointConfig(), 2), WorldShare(0, 2, 2), alone(), 0)
 
 
 class InTurn(Gang):

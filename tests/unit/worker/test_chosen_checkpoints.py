@@ -14,7 +14,7 @@ import torch.distributed as dist
 
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
-from worker.learning.distributed import Gang, Placement
+from worker.learning.distributed import Gang, RankPlacement
 from worker.learning.job import Job
 from worker.learning.teacher import give_teacher
 from worker.learning.trained import choose_checkpoint
@@ -25,7 +25,7 @@ from worker.settings.errors import UserError
 def gangs() -> list[Gang]:
     """Both ranks of a gang of two, to be called one after the other, the main rank first."""
     store = dist.HashStore()
-    return [Gang(Placement(rank=rank, world_size=2), "cpu", store, ["here", "there"]) for rank in (0, 1)]
+    return [Gang(RankPlacement(rank=rank, world_size=2), "cpu", store, ["here", "there"]) for rank in (0, 1)]
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.wrappers.vector import DictInfoToList, RecordEpisodeStatistics
 
 from tests.support.worker.rsl_loop import Seen
-from worker.learning.rsl.environment import TaskVecEnv
+from worker.learning.rsl.vector_environment import TaskVecEnv
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.run.find import BUILT_IN
 from worker.tasks.run.gym import TaskVectorEnv

@@ -31,7 +31,7 @@ from worker.settings.cartpole import CartpoleConfig
 from worker.tasks import terms
 from worker.tasks.declare.declaration import Declaration, Metric
 from worker.tasks.library.cartpole import Cartpole
-from worker.tasks.run.episode_records import Ended
+from worker.tasks.run.episode_records import LastEpisodes
 
 GANG = alone()
 
@@ -141,7 +141,7 @@ def test_a_success_that_names_nothing_is_refused_and_a_task_without_terminations
         judged("sped").sketch(config())
     flags, causes = torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
     names = ["time_out", "physics_failed", "terminated"]
-    without = Ended(torch.zeros(1, 2), causes, flags, names, [], None, False)
+    without = LastEpisodes(torch.zeros(1, 2), causes, flags, names, [], None, False)
     assert not without.says_success and without.meaning == "the task does not say"
 
 

@@ -26,8 +26,8 @@ from tests.support.worker.sac import make, point
 from worker.deploy import bundle
 from worker.deploy.bundle import Files, _publish, bundle_files
 from worker.deploy.leapp_description import leapp_description
-from worker.deploy.model import OnnxPolicy, metadata_of, to_onnx
-from worker.deploy.parity import Recording
+from worker.deploy.model_file import OnnxPolicy, metadata_of, to_onnx
+from worker.deploy.parity import RecordedObservations
 from worker.deploy.rollouts import judge
 from worker.evaluation.episodes import Episodes
 from worker.learning.algorithm import ExportedPolicy
@@ -85,7 +85,9 @@ def files_of(policy: Any) -> Files:
     numbers = np.random.default_rng(0).standard_normal((6, 3, 2), dtype=np.float32)
     begins = np.zeros((6, 3), dtype=bool)
     begins[0], begins[4, 1] = True, True
-    return bundle_files(policy, exported, contract, "mine:Mine", {"rollout": Recording({"obs": numbers}, begins)})
+    return bundle_files(
+        policy, exported, contract, "mine:Mine", {"rollout": RecordedObservations({"obs": numbers}, begins)}
+    )
 
 
 def test_a_memory_that_the_export_does_not_have_is_refused() -> None:

@@ -13,7 +13,7 @@ import torch
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import TASK as POINT
 from tests.support.worker.point_task import PointConfig
-from worker.learning import memory
+from worker.learning import memory_estimate
 from worker.learning.algorithms import find_algorithm
 from worker.learning.ppo.fused import PPO
 from worker.settings.errors import UserError, is_out_of_memory
@@ -32,16 +32,19 @@ LEARNER = PPO, CONFIG.ppo
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Smaller builds than a rank's; and each collects garbage twice, of which what was there before is no part."""
-    monkeypatch.setattr(memory, "MORE", 512)
+    monkeypatch.setattr(memory_estimate, "MORE", 512)
     freeze()
     yield
     unfreeze()
 
 
 def test_fitting_worlds_continue_and_other_errors_are_unchanged() -> None:
-    with memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
+    with memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         pass
-    with pytest.raises(RuntimeError, match="something else"), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
+    with (
+        pytest.raises(RuntimeError, match="something else"),
+        memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE),
+    ):
         raise RuntimeError("something else")
 
 
@@ -59,13 +62,13 @@ def test_a_failed_allocation_is_reported_as_such(monkeypatch: pytest.MonkeyPatch
     assert not is_out_of_memory(ValueError("the memory of a GRU is of no use here"))
     error = FULL[0]
     there = r"^worlds: 64 worlds of Point on rank 0 need more memory than there is; set fewer"
-    with pytest.raises(UserError, match=there), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
+    with pytest.raises(UserError, match=there), memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         raise error  # 64 worlds would fit: somebody else took it
-    monkeypatch.setattr(memory, "free_bytes", lambda gang: 100_000)
+    monkeypatch.setattr(memory_estimate, "free_bytes", lambda gang: 100_000)
     little = r"than the 0.0 GB that are free: about 0.0 GB. (About \d+ fit|Not even one fits): set "
-    with pytest.raises(UserError, match=little), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
+    with pytest.raises(UserError, match=little), memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         raise error
-    with pytest.raises(type(error)), memory.within_memory(POINT, CONFIG, LEARNER, 64, HERE, lambda: False):
+    with pytest.raises(type(error)), memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE, lambda: False):
         raise error  # long after the start: not the worlds' fault, and not the user's
 
 
@@ -86,13 +89,16 @@ def test_more_worlds_than_fit_are_refused_before_they_are_built_whatever_learns(
         r"^worlds: 200,000,000 worlds of Point on rank 0 need more memory than the [\d.]+ GB that are free: "
         r"about [\d,.]+ GB\. About [\d,]+ fit: set `worlds`$"
     )
-    with pytest.raises(UserError, match=there), memory.within_memory(POINT, CONFIG, learner, 200_000_000, HERE):
+    with (
+        pytest.raises(UserError, match=there),
+        memory_estimate.within_memory(POINT, CONFIG, learner, 200_000_000, HERE),
+    ):
         pytest.fail("they are not to be built")
 
 
 def test_a_batch_of_sac_is_measured_although_the_first_iteration_only_collects() -> None:
-    def need(settings: SACConfig) -> memory.Need:
-        return memory.measure(POINT, CONFIG, (find_algorithm("sac"), settings), HERE)
+    def need(settings: SACConfig) -> memory_estimate.Need:
+        return memory_estimate.measure(POINT, CONFIG, (find_algorithm("sac"), settings), HERE)
 
     sac = dataclasses.replace(CartpoleConfig().sac, updates=2, warm_up=3000)
     few, many = need(sac), need(dataclasses.replace(sac, batch_size=32_768))
@@ -102,9 +108,9 @@ def test_a_batch_of_sac_is_measured_although_the_first_iteration_only_collects()
 
 
 def test_constant_memory_leaves_less_for_the_worlds() -> None:
-    told = memory._explain(Cartpole, 1000, HERE, 10_000_000, memory.Need(4.5e6, 9_000.0))
+    told = memory_estimate._explain(Cartpole, 1000, HERE, 10_000_000, memory_estimate.Need(4.5e6, 9_000.0))
     assert told.endswith("than the 0.0 GB that are free: about 0.0 GB. About 500 fit: set `worlds`")
-    told = memory._explain(Cartpole, 1000, HERE, 10_000_000, memory.Need(9e6, 9_000.0))
+    told = memory_estimate._explain(Cartpole, 1000, HERE, 10_000_000, memory_estimate.Need(9e6, 9_000.0))
     assert told.endswith("Not even one fits: set smaller networks or batches")
 
 
@@ -113,6 +119,6 @@ def test_settings_that_cannot_be_are_the_users_error_here_too() -> None:
     learner = PPO, CartpoleConfig().ppo
     with (
         pytest.raises(UserError, match="the robot is fixed"),
-        memory.within_memory(Cartpole, pushed, learner, 9000, HERE),
+        memory_estimate.within_memory(Cartpole, pushed, learner, 9000, HERE),
     ):
         pytest.fail("nothing is to be built")

@@ -19,8 +19,8 @@ from tensordict import TensorDict
 from tests.support.refusals import refusal
 from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
-from worker.learning.algorithm import Setting, Share, Spaces, Transition
-from worker.learning.distributed import Gang, Placement
+from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
+from worker.learning.distributed import Gang, RankPlacement
 from worker.learning.plain_ppo import Network, PlainPPO
 from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.loss import LOSSES
@@ -41,7 +41,7 @@ class Watched(PlainPPO):
         return self.samples
 
 
-def twins(setting: Setting, **settings: Any) -> tuple[PPO, Watched]:
+def twins(setting: LearningSetting, **settings: Any) -> tuple[PPO, Watched]:
     """The two with the same weights."""
     config = dataclasses.replace(PointPPO(), **settings)
     fused, plain = PPO(config, setting), Watched(config, setting)
@@ -95,7 +95,7 @@ def test_both_implementations_learn_the_same_on_random_data(settings: dict[str, 
     """Three observations and two actions, of sizes far from 1; a quarter of the steps end an episode, half of those by the clock."""
     torch.manual_seed(8)
     spaces = Spaces({"policy": (3,), "critic": (5,)}, 2)
-    setting = Setting(spaces, Share(0, WORLDS, WORLDS), alone(), seed=4, action_ranges=((-1.0, 1.0), None))
+    setting = LearningSetting(spaces, WorldShare(0, WORLDS, WORLDS), alone(), seed=4, action_ranges=((-1.0, 1.0), None))
     fused, plain = twins(setting, **{"epochs": 3, "minibatches": 4, "gamma": 0.95, "lam": 0.9, **settings})
     scale = {"policy": torch.tensor([1.0, 30.0, 0.1]), "critic": torch.tensor([1.0, 2.0, 3.0, 4.0, 5.0])}
 
@@ -136,7 +136,7 @@ class Part(Gang):
     """One of several ranks that are threads of this process."""
 
     def __init__(self, rank: int, shared: list[torch.Tensor], meeting: threading.Barrier) -> None:
-        super().__init__(Placement(rank=rank, world_size=len(shared)), "cpu", None, ["here"] * len(shared))
+        super().__init__(RankPlacement(rank=rank, world_size=len(shared)), "cpu", None, ["here"] * len(shared))
         self.shared, self.meeting = shared, meeting
 
     def sum(self, tensor: torch.Tensor) -> torch.Tensor:
@@ -163,12 +163,12 @@ def test_two_ranks_learn_the_same_as_the_fused_one_alone() -> None:
     began: dict[int, list[torch.Tensor]] = {}
     ended: dict[int, tuple[Watched, dict[str, torch.Tensor]]] = {}
 
-    def rank(number: int, share: Share) -> None:
+    def rank(number: int, share: WorldShare) -> None:
         try:
             task = Point(PointConfig(), share.count, seed=2, first_world=share.first)
             gang = Part(number, shared, meeting)
             meeting.wait(60)
-            part = Watched(plain.config, Setting(spaces_of(task), share, gang, 4))
+            part = Watched(plain.config, LearningSetting(spaces_of(task), share, gang, 4))
             began[number] = [parameter.detach().clone() for parameter in part.parameters]
             part.actor.load_state_dict(plain.actor.state_dict())
             part.critic.load_state_dict(plain.critic.state_dict())
@@ -177,7 +177,7 @@ def test_two_ranks_learn_the_same_as_the_fused_one_alone() -> None:
             meeting.abort()
             raise
 
-    shares = Share(0, 2, WORLDS), Share(2, 4, WORLDS)
+    shares = WorldShare(0, 2, WORLDS), WorldShare(2, 4, WORLDS)
     threads = [threading.Thread(target=rank, args=(number, share)) for number, share in enumerate(shares)]
     for thread in threads:
         thread.start()
@@ -230,7 +230,7 @@ def test_it_goes_on_from_its_state_with_the_same_bits() -> None:
 
 def test_an_unsupported_setting_is_refused_with_an_alternative() -> None:
     def refused(spaces: Spaces, **settings: Any) -> str:
-        setting = Setting(spaces, Share(0, 2, 2), alone(), 0)
+        setting = LearningSetting(spaces, WorldShare(0, 2, 2), alone(), 0)
         return refusal(PlainPPO, dataclasses.replace(PointPPO(), **settings), setting)
 
     numbers = {"policy": (2,)}
@@ -247,7 +247,7 @@ def test_a_normaliser_has_the_moments_of_all_that_it_has_seen() -> None:
     torch.manual_seed(2)
     seen = 3.0 * torch.randn(5, 12, 2) + torch.tensor([4.0, -100.0])
     network = Network(2, (4,), 1, PointPPO())
-    setting = Setting(Spaces({"policy": (2,)}, 1), Share(0, 4, 4), alone(), 0)
+    setting = LearningSetting(Spaces({"policy": (2,)}, 1), WorldShare(0, 4, 4), alone(), 0)
     for part in seen:
         network.update_normalizer(part, setting)
     together = seen.flatten(0, 1)

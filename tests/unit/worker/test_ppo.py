@@ -16,7 +16,7 @@ from torch.distributions import Normal
 
 from tests.support.worker.loop import alone, iterate, transition_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
-from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.fused import METRICS, PPO
 from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
@@ -27,9 +27,9 @@ from worker.settings.ppo import PPOConfig
 
 def make(worlds: int = 4, first: int = 0, total: int | None = None, *, plain: bool = False, **settings: object) -> PPO:
     torch.manual_seed(5)
-    share = Share(first, worlds, total or worlds)
+    share = WorldShare(first, worlds, total or worlds)
     spaces = Spaces({"policy": (2,), "critic": (2,)}, 1)
-    return PPO(dataclasses.replace(PointPPO(), **settings), Setting(spaces, share, alone(), 1), plain=plain)
+    return PPO(dataclasses.replace(PointPPO(), **settings), LearningSetting(spaces, share, alone(), 1), plain=plain)
 
 
 def groups(observations: torch.Tensor) -> TensorDict:
@@ -161,7 +161,7 @@ def test_metrics_of_a_rollout_by_hand() -> None:
     """Rewards as in the test of the advantages: returns (1.9, 0, 5.6), values (1, 2, 3)."""
     torch.manual_seed(5)
     spaces = Spaces({"policy": (2,), "critic": (2,)}, 1)
-    setting = Setting(spaces, Share(0, 1, 1), alone(), 1, action_ranges=((-0.5, 2.0),))
+    setting = LearningSetting(spaces, WorldShare(0, 1, 1), alone(), 1, action_ranges=((-0.5, 2.0),))
     ppo = PPO(dataclasses.replace(PointPPO(), **RETURNS, epochs=1), setting)
     ppo.critic.mlp = FirstComponent()
     play(ppo, VALUES, [1, 0, 2], [0, 1, 0], [0, 0, 0], torch.full((3, 2), float("nan")))
@@ -227,7 +227,7 @@ def test_noise_is_normal_and_independent() -> None:
 
 
 def test_shares_cover_all_worlds_once() -> None:
-    shares = [Share.of(rank, 3, 8) for rank in range(3)]
+    shares = [WorldShare.of(rank, 3, 8) for rank in range(3)]
     assert [(share.first, share.count) for share in shares] == [(0, 2), (2, 3), (5, 3)]
 
 
@@ -390,10 +390,13 @@ def test_whole_updates_are_those_of_the_plain_loss(settings: dict[str, object]) 
 
 def test_unsupported_settings_are_refused_by_name() -> None:
     with pytest.raises(ValueError, match=r"critic_observations: the task has no group 'critic'; it has policy"):
-        PPO(PointPPO(critic_observations="critic"), Setting(Spaces({"policy": (2,)}, 1), Share(0, 4, 4), alone(), 1))
+        PPO(
+            PointPPO(critic_observations="critic"),
+            LearningSetting(Spaces({"policy": (2,)}, 1), WorldShare(0, 4, 4), alone(), 1),
+        )
     with pytest.raises(ValueError, match=r"'critic' is a group of images .*; rsl_rl can do that"):
         spaces = Spaces({"policy": (2,), "critic": (3, 8, 8)}, 1)
-        PPO(PointPPO(critic_observations="critic"), Setting(spaces, Share(0, 4, 4), alone(), 1))
+        PPO(PointPPO(critic_observations="critic"), LearningSetting(spaces, WorldShare(0, 4, 4), alone(), 1))
     with pytest.raises(ValueError, match=r"minibatches: 9 minibatches need as many steps of each world, there are 8"):
         PPOConfig(steps=8, minibatches=9)
     with pytest.raises(ValueError, match="adam has none; set optimizer: adamw"):

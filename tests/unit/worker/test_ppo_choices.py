@@ -11,11 +11,11 @@ from torch.distributions import Categorical
 
 from tests.support.worker.loop import alone
 from tests.support.worker.point_task import PointPPO
-from worker.learning.algorithm import Setting, Share, Spaces
+from worker.learning.algorithm import LearningSetting, Spaces, WorldShare
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.loss import Clipping, Samples, clipped_loss
-from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
+from worker.learning.ppo.networks import ActorPolicy, PixelModel, build_actor, build_critic
 from worker.settings.ppo import PPOConfig
 
 SMALL: dict[str, Any] = {"channels": (4, 6), "kernel_sizes": (3, 2), "strides": (2, 1), "hidden_sizes": (8,)}
@@ -25,7 +25,7 @@ IMAGES = Spaces({"policy": (3, 7, 9)}, 2)
 def learner(**settings: Any) -> PPO:
     torch.manual_seed(2)
     spaces = Spaces({"policy": (2,)}, 3, discrete=True)
-    return PPO(PointPPO(steps=4, minibatches=2, **settings), Setting(spaces, Share(0, 5, 5), alone(), 1))
+    return PPO(PointPPO(steps=4, minibatches=2, **settings), LearningSetting(spaces, WorldShare(0, 5, 5), alone(), 1))
 
 
 def drawn(first: int, worlds: int, step: int, logits: torch.Tensor, iteration: int = 1) -> torch.Tensor:
@@ -121,7 +121,7 @@ def test_images_have_the_convolutions_of_the_settings_which_a_critic_of_the_same
 
 def test_where_the_clock_cut_an_episode_of_images_its_future_is_the_value_of_the_image_before() -> None:
     config = PPOConfig(steps=2, minibatches=1, **SMALL)
-    ppo = PPO(config, Setting(IMAGES, Share(0, 2, 2), alone(), 1))
+    ppo = PPO(config, LearningSetting(IMAGES, WorldShare(0, 2, 2), alone(), 1))
     ppo.rollout.rewards.fill_(1.0)
     ppo.rollout.values.copy_(torch.tensor([[5.0, 6.0], [7.0, 8.0]]))
     ppo.rollout.time_outs.copy_(torch.tensor([[0.0, 1.0], [1.0, 0.0]]))

@@ -20,9 +20,9 @@ from tests.support.worker.loop import alone, groups, spaces_of, transition_of
 from tests.support.worker.onnx import onnx_of
 from tests.support.worker.rsl_loop import GRU, Seen, build, restore, save, settings, train
 from tests.support.worker.sac import same
-from worker.learning.algorithm import Setting, Share, Spaces
+from worker.learning.algorithm import LearningSetting, Spaces, WorldShare
 from worker.learning.rsl.algorithm import RslRl
-from worker.learning.rsl.environment import TaskVecEnv
+from worker.learning.rsl.vector_environment import TaskVecEnv
 
 torch.set_num_threads(1)
 
@@ -173,7 +173,7 @@ def test_rsl_rl_s_refusal_is_reported_in_one_line_with_its_place(section: dict[s
 
 
 def test_choices_are_refused() -> None:
-    setting = Setting(Spaces({"policy": (2,)}, 3, discrete=True), Share(0, 8, 8), alone(), 1)
+    setting = LearningSetting(Spaces({"policy": (2,)}, 3, discrete=True), WorldShare(0, 8, 8), alone(), 1)
     with pytest.raises(ValueError, match=r"^rsl_rl: .* actions of this task are choices$"):
         RslRl(settings({}), setting)
 

@@ -15,9 +15,9 @@ from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces
 from tests.support.worker.onnx import onnx_of
 from tests.support.worker.point_task import Point, PointConfig
 from tests.support.worker.sac import SMALL, make, point, same
-from worker.learning.algorithm import Algorithm, Policy, Setting, Share, Spaces
+from worker.learning.algorithm import Algorithm, LearningSetting, Policy, Spaces, WorldShare
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.distributed import Gang, Placement
+from worker.learning.distributed import Gang, RankPlacement
 from worker.learning.host_copies import HostCopies
 from worker.learning.sac.sac import SAC, SAVED
 from worker.settings.sac import SACConfig
@@ -71,7 +71,7 @@ NO_GROUP = "critic_group: there is no observation group 'critic'"
     ],
 )
 def test_an_unsupported_setting_is_refused(spaces: Spaces, settings: dict[str, Any], message: str) -> None:
-    setting = Setting(spaces, Share(0, 2, 2), alone(), 0)
+    setting = LearningSetting(spaces, WorldShare(0, 2, 2), alone(), 0)
     with pytest.raises(ValueError, match=f"^sac.*{message}"):
         SAC(dataclasses.replace(SMALL, **settings), setting)
 
@@ -144,7 +144,7 @@ def test_a_small_replay_is_saved_and_a_large_one_is_not(
     told = "checkpoints do not hold the replay, 0 MiB a rank: a run that is resumed fills a new one first "
     assert capsys.readouterr().out.startswith(told)
     assert make(task, save_replay=True).world_state() and not make(task, save_replay=False).world_state()
-    make(point(2), gang=Half(1), share=Share(3, 2, 5))
+    make(point(2), gang=Half(1), share=WorldShare(3, 2, 5))
     SAC(SMALL, dataclasses.replace(setting_of(task), rehearsal=True))
     assert not capsys.readouterr().out, "the main rank tells it, and only of a run that is to begin"
 
@@ -153,7 +153,7 @@ def test_a_small_replay_is_saved_and_a_large_one_is_not(
 def test_all_ranks_save_their_replay_or_none(monkeypatch: pytest.MonkeyPatch, total: int, saved: bool) -> None:
     """The rank with the most worlds decides."""
     monkeypatch.setitem(SAVED, "cpu", 32 * (2 * 2 + 1 + 3) * 4 * 3)
-    shares = [Share.of(rank, 2, total) for rank in range(2)]
+    shares = [WorldShare.of(rank, 2, total) for rank in range(2)]
     assert shares[0].count < shares[1].count and shares[0].count <= 3
     made = [make(point(share.count), gang=Half(rank), share=share) for rank, share in enumerate(shares)]
     assert [bool(sac.world_state()) for sac in made] == [saved, saved]
@@ -290,7 +290,7 @@ class Half(Gang):
     """One of two ranks in this process: what it would share is kept until both are there."""
 
     def __init__(self, rank: int) -> None:
-        super().__init__(Placement(rank=rank, world_size=2), "cpu", None, ["here", "there"])
+        super().__init__(RankPlacement(rank=rank, world_size=2), "cpu", None, ["here", "there"])
 
     def sum(self, tensor: torch.Tensor) -> torch.Tensor:
         return tensor
@@ -306,7 +306,7 @@ def test_two_ranks_take_the_step_that_one_takes_with_the_same_samples() -> None:
     one = make(one_task, **settings)
     ranks = [
         make(task, gang=Half(rank), share=share, **settings)
-        for rank, (task, share) in enumerate(zip(tasks, (Share(0, 2, 6), Share(2, 4, 6)), strict=True))
+        for rank, (task, share) in enumerate(zip(tasks, (WorldShare(0, 2, 6), WorldShare(2, 4, 6)), strict=True))
     ]
     assert [sac.learner.samples for sac in ranks] == [12, 13]
     for sac, task in ((one, one_task), *zip(ranks, tasks, strict=True)):
@@ -331,4 +331,4 @@ def test_two_ranks_take_the_step_that_one_takes_with_the_same_samples() -> None:
     together = ranks[0].learner.shared(True) + ranks[1].learner.shared(True)
     torch.testing.assert_close(one.learner.shared(True), together, atol=1e-6, rtol=1e-4)
     with pytest.raises(ValueError, match=r"sac.batch_size: 2 ranks need at least as many samples, got 1"):
-        make(tasks[0], gang=Half(0), share=Share(0, 2, 6), batch_size=1)
+        make(tasks[0], gang=Half(0), share=WorldShare(0, 2, 6), batch_size=1)

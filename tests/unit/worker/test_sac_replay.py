@@ -10,9 +10,9 @@ from tensordict import TensorDict
 
 from tests.support.worker.loop import alone, groups, iterate, transition_of
 from tests.support.worker.sac import SMALL, make, point
-from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.sac import kernels
-from worker.learning.sac.replay import Replay
+from worker.learning.sac.replay_buffer import ReplayBuffer
 from worker.learning.sac.sac import SAC
 
 torch.set_num_threads(1)
@@ -38,7 +38,7 @@ def test_exploring_is_normal_noise_squashed_or_uniform() -> None:
 def test_actions_of_an_iteration_do_not_depend_on_the_ranks() -> None:
     def actions(first: int, count: int) -> torch.Tensor:
         task, drawn = point(count, first), []
-        sac = make(task, share=Share(first, count, 6), warm_up=0)
+        sac = make(task, share=WorldShare(first, count, 6), warm_up=0)
         for iteration in range(2):
             sac.begin(iteration)
             for _ in range(sac.steps):
@@ -64,7 +64,9 @@ def test_actions_are_random_until_the_first_update() -> None:
     assert sac.state_dict()["updates"] == 8, "4 steps are too few for the first iteration, 8 are enough"
 
 
-def fill(replay: Replay, steps: int, ends: torch.Tensor | None = None, time_outs: torch.Tensor | None = None) -> None:
+def fill(
+    replay: ReplayBuffer, steps: int, ends: torch.Tensor | None = None, time_outs: torch.Tensor | None = None
+) -> None:
     """Write ``steps`` steps whose observations, actions and rewards say which step, counted from 0, and which world they are of."""
     slot = torch.zeros(1, dtype=torch.int64)
     for step in range(steps):
@@ -82,7 +84,7 @@ def test_only_what_is_there_is_drawn_and_all_of_it(n_step: int) -> None:
     worlds, capacity = 3, 7
     generator = torch.Generator().manual_seed(0)
     for recorded in range(1, 24):
-        replay = Replay(capacity, worlds, 1, 1, n_step, 0.9, "cpu")
+        replay = ReplayBuffer(capacity, worlds, 1, 1, n_step, 0.9, "cpu")
         fill(replay, recorded)
         rows = torch.zeros(4000, dtype=torch.int64)
         there = replay.draw(rows, generator)
@@ -133,7 +135,7 @@ def test_returns_of_n_steps_against_a_loop(n_step: int) -> None:
     generator = torch.Generator().manual_seed(1)
     ends = torch.rand(steps, worlds, generator=generator) < 0.3
     time_outs = ends & (torch.rand(steps, worlds, generator=generator) < 0.5)
-    replay = Replay(capacity, worlds, 1, 1, n_step, gamma, "cpu")
+    replay = ReplayBuffer(capacity, worlds, 1, 1, n_step, gamma, "cpu")
     fill(replay, steps, ends, time_outs)
     rows = torch.zeros(2000, dtype=torch.int64)
     assert replay.draw(rows, generator)
@@ -154,7 +156,7 @@ def transition(observation: float, terminal: float, reward: float, done: bool, t
 
 
 def test_a_time_out_bootstraps_from_the_observation_before_the_reset_and_a_termination_does_not() -> None:
-    setting = Setting(Spaces({"policy": (1,)}, 1), Share(0, 1, 1), alone(), 0)
+    setting = LearningSetting(Spaces({"policy": (1,)}, 1), WorldShare(0, 1, 1), alone(), 0)
     sac = SAC(dataclasses.replace(SMALL, atoms=1, steps=3, warm_up=100, normalize_observations=False), setting)
     nan = float("nan")
     sac.begin(0)

@@ -13,11 +13,11 @@ from torch.distributions import Normal, TanhTransform, TransformedDistribution
 
 from tests.support.worker.loop import alone, iterate
 from tests.support.worker.sac import SMALL, make, point, same
-from worker.learning.algorithm import Setting, Share, Spaces, Transition
+from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES
-from worker.learning.sac.networks import Actor, Critics
-from worker.learning.sac.replay import Batch
+from worker.learning.sac.networks import Critics, SquashedGaussianActor
+from worker.learning.sac.replay_buffer import Batch
 from worker.learning.sac.sac import SAC
 from worker.settings.sac import SACConfig
 
@@ -111,7 +111,7 @@ def test_several_critics_are_each_a_network_of_its_own(layer_norm: bool) -> None
 
 def test_log_probabilities_are_those_of_torch() -> None:
     torch.manual_seed(0)
-    actor = Actor(dataclasses.replace(SMALL, action_limit=2.0), 3, 2)
+    actor = SquashedGaussianActor(dataclasses.replace(SMALL, action_limit=2.0), 3, 2)
     with torch.no_grad():
         actor.head.weight.normal_()
     observations, noise = torch.randn(50, 3), torch.randn(50, 2)
@@ -124,7 +124,7 @@ def test_log_probabilities_are_those_of_torch() -> None:
 
 
 def test_the_first_policy_is_centred_with_the_configured_width() -> None:
-    actor = Actor(dataclasses.replace(SMALL, init_std=0.3), 3, 2)
+    actor = SquashedGaussianActor(dataclasses.replace(SMALL, init_std=0.3), 3, 2)
     mean, log_std = actor(torch.randn(50, 3))
     assert mean.abs().max() < 0.05
     torch.testing.assert_close(log_std.exp(), torch.full((50, 2), 0.3), atol=0.02, rtol=0)
@@ -213,7 +213,7 @@ def test_gradients_are_clipped_by_their_norm() -> None:
 
 
 def test_critics_may_have_observations_that_the_policy_lacks() -> None:
-    setting = Setting(Spaces({"policy": (2,), "critic": (3,)}, 1), Share(0, 4, 4), alone(), 0)
+    setting = LearningSetting(Spaces({"policy": (2,), "critic": (3,)}, 1), WorldShare(0, 4, 4), alone(), 0)
     sac = SAC(dataclasses.replace(SMALL, critic_group="critic", warm_up=0), setting)
     assert sac.learner.critics.each[0][0].in_features == 4 and sac.learner.actor.body[0].in_features == 2
     torch.manual_seed(0)

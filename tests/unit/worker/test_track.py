@@ -20,8 +20,8 @@ from shared_store.volume.metrics import MetricsWriter, scalars
 from tests.conftest import REPOSITORY
 from worker import track
 from worker.learning.job import Job
-from worker.telemetry.services import Ending
-from worker.telemetry.tracking import Tracking
+from worker.telemetry.services import TrainingEnd
+from worker.telemetry.tracking_processes import Tracking
 from worker.track import Sender, Turn
 
 TRAIN = {"task": "Cartpole", "ppo": {"learning_rate": 0.001}}
@@ -33,7 +33,7 @@ class Memory:
     def __init__(self) -> None:
         self.sent: dict[str, list[tuple[int, float]]] = {}
         self.left: list[str] = []
-        self.ended: list[Ending] = []
+        self.ended: list[TrainingEnd] = []
         self.trouble: Exception | None = None
         self.identity = ""
 
@@ -55,7 +55,7 @@ class Memory:
             raise self.trouble
         self.sent[self.identity] += [(each["iteration"], each["reward"]) for each in records]
 
-    def finish(self, ending: Ending) -> None:
+    def finish(self, ending: TrainingEnd) -> None:
         self.ended.append(ending)
 
     def leave(self) -> None:
@@ -186,8 +186,8 @@ def test_the_end_of_a_training_comes_with_its_evaluation_and_pictures_and_that_o
     sending.finish("finished")
     figures = {"return": 2.5, "length": 9.0, "success": 0.75, "error_vel_xy": 0.125}
     last = {f"evaluation/{name}": value for name, value in figures.items()}
-    finished = Ending("finished", 4, last, [run.metrics / "reward.png", own])
-    assert service.ended == [Ending("stopped", 4, {}, []), finished]
+    finished = TrainingEnd("finished", 4, last, [run.metrics / "reward.png", own])
+    assert service.ended == [TrainingEnd("stopped", 4, {}, []), finished]
 
 
 def test_a_records_numbers_have_the_names_that_tensorboard_shows() -> None:

@@ -26,7 +26,7 @@ import torch
 from tensordict import TensorDict
 
 from worker.learning import moments
-from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
+from worker.learning.algorithm import POLICY, LearningSetting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.optimizers import load_optimizer
 from worker.learning.ppo import draws, objective
@@ -34,8 +34,8 @@ from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.heads import Categorical, Gaussian, Head
 from worker.learning.ppo.loss import LOSSES, Clipping
-from worker.learning.ppo.models import ActorPolicy, PixelModel, build_actor, build_critic
-from worker.learning.ppo.rollout import Rollout, View
+from worker.learning.ppo.networks import ActorPolicy, PixelModel, build_actor, build_critic
+from worker.learning.ppo.rollout_buffer import GroupRollout, RolloutBuffer
 from worker.learning.totals import Totals
 from worker.settings.ppo import PPOConfig
 
@@ -52,7 +52,7 @@ class PPO:
     captures_rollout: ClassVar[bool] = True
     kernels: ClassVar[tuple[ModuleType, ...]] = (draws, objective)
 
-    def __init__(self, config: PPOConfig, setting: Setting, *, plain: bool = False) -> None:
+    def __init__(self, config: PPOConfig, setting: LearningSetting, *, plain: bool = False) -> None:
         """``plain``: compute the loss in plain torch instead of the kernel. Raises ValueError for unsupported settings."""
         self.config, self.setting, self.gang = config, setting, setting.gang
         self.steps, self.device = config.steps, setting.gang.device
@@ -61,11 +61,11 @@ class PPO:
         self.critic = build_critic(config, spaces, self.actor).to(self.device)
         self.actor.to(self.device)
         self._policy = ActorPolicy(self.actor, spaces)
-        actor = View(self.actor, POLICY, spaces.observations[POLICY], self.steps, worlds, self.device)
+        actor = GroupRollout(self.actor, POLICY, spaces.observations[POLICY], self.steps, worlds, self.device)
         critic, group = actor, config.critic_observations
         if group != POLICY:
-            critic = View(self.critic, group, spaces.observations[group], self.steps, worlds, self.device)
-        self.rollout = Rollout(actor, critic, spaces.actions, 1 if spaces.discrete else spaces.actions)
+            critic = GroupRollout(self.critic, group, spaces.observations[group], self.steps, worlds, self.device)
+        self.rollout = RolloutBuffer(actor, critic, spaces.actions, 1 if spaces.discrete else spaces.actions)
         self._draws = Draws(setting.seed, setting.share.first, self.device)
         self._side = torch.cuda.Stream(self.device) if self.device.startswith("cuda") else None
         self._allocate_sums()
@@ -302,7 +302,7 @@ class PPO:
         for metric, value in zip(self._metrics[len(LOSSES) :], found, strict=True):
             metric.copy_(value)
 
-    def _is_normalised(self, view: View) -> bool:
+    def _is_normalised(self, view: GroupRollout) -> bool:
         return not isinstance(view.model, PixelModel) and bool(view.model.obs_normalization)
 
     @contextlib.contextmanager

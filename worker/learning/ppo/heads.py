@@ -10,9 +10,9 @@ from rsl_rl.modules.distribution import GaussianDistribution
 
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms, is_clipped
-from worker.learning.ppo.models import PixelModel
+from worker.learning.ppo.networks import PixelModel
 from worker.learning.ppo.objective import Objective
-from worker.learning.ppo.rollout import Rollout
+from worker.learning.ppo.rollout_buffer import RolloutBuffer
 
 
 class Head(Protocol):
@@ -24,11 +24,11 @@ class Head(Protocol):
     def draw(self, draws: Draws, step: int, outputs: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Fill ``out``, shape (worlds, actions), with actions drawn by the network's ``outputs``."""
 
-    def log_prob(self, rollout: Rollout) -> torch.Tensor:
+    def log_prob(self, rollout: RolloutBuffer) -> torch.Tensor:
         """Log-probability of the rollout's actions, shape (steps, worlds)."""
 
     def backward(
-        self, rows: torch.Tensor, rollout: Rollout, outputs: torch.Tensor, values: torch.Tensor
+        self, rows: torch.Tensor, rollout: RolloutBuffer, outputs: torch.Tensor, values: torch.Tensor
     ) -> torch.Tensor:
         """Add the gradient of the loss to the parameters behind ``outputs`` and ``values``.
 
@@ -85,12 +85,12 @@ class Gaussian:
     def draw(self, draws: Draws, step: int, outputs: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         return draws.normal(step, outputs, self.std, out)
 
-    def log_prob(self, rollout: Rollout) -> torch.Tensor:
+    def log_prob(self, rollout: RolloutBuffer) -> torch.Tensor:
         flat = rollout.outputs.flatten(0, 1)
         return gaussian_terms(rollout.actions.flatten(0, 1), flat, self.std, flat, self.std)[0].view_as(rollout.values)
 
     def backward(
-        self, rows: torch.Tensor, rollout: Rollout, outputs: torch.Tensor, values: torch.Tensor
+        self, rows: torch.Tensor, rollout: RolloutBuffer, outputs: torch.Tensor, values: torch.Tensor
     ) -> torch.Tensor:
         actions, means = rollout.actions.flatten(0, 1), rollout.outputs.flatten(0, 1)
         if self._objective is not None:
@@ -123,12 +123,12 @@ class Categorical:
     def draw(self, draws: Draws, step: int, outputs: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         return draws.choices(step, outputs, out)
 
-    def log_prob(self, rollout: Rollout) -> torch.Tensor:
+    def log_prob(self, rollout: RolloutBuffer) -> torch.Tensor:
         flat = rollout.outputs.flatten(0, 1)
         return categorical_terms(rollout.actions.flatten(0, 1), flat, flat)[0].view_as(rollout.values)
 
     def backward(
-        self, rows: torch.Tensor, rollout: Rollout, outputs: torch.Tensor, values: torch.Tensor
+        self, rows: torch.Tensor, rollout: RolloutBuffer, outputs: torch.Tensor, values: torch.Tensor
     ) -> torch.Tensor:
         actions, logits = rollout.actions.flatten(0, 1), rollout.outputs.flatten(0, 1)
         terms = categorical_terms(actions[rows], logits[rows], outputs)
@@ -144,7 +144,7 @@ class Categorical:
 def _backward(
     head: Gaussian | Categorical,
     rows: torch.Tensor,
-    rollout: Rollout,
+    rollout: RolloutBuffer,
     terms: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
     values: torch.Tensor,
 ) -> torch.Tensor:

@@ -17,11 +17,11 @@ from rsl_rl.algorithms import Distillation
 from rsl_rl.modules import EmpiricalNormalization
 from tensordict import TensorDict
 
-from worker.learning.algorithm import POLICY, Policy, Setting, Spaces, Transition
+from worker.learning.algorithm import POLICY, LearningSetting, Policy, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.rsl import construction as building
-from worker.learning.rsl.environment import as_floats
 from worker.learning.rsl.policy import RslRlPolicy
+from worker.learning.rsl.vector_environment import as_floats
 from worker.settings.rsl_rl import NETWORKS, RslRlConfig
 
 
@@ -35,7 +35,7 @@ class RslRl:
     config_type: ClassVar[Any] = RslRlConfig
     captures_rollout: ClassVar[bool] = False
 
-    def __init__(self, config: RslRlConfig, setting: Setting) -> None:
+    def __init__(self, config: RslRlConfig, setting: LearningSetting) -> None:
         """Build the algorithm of ``config``. Raises ValueError, in one line with the key, for settings that rsl_rl refuses."""
         self.steps = config.num_steps_per_env
         self.teacher_checkpoint = config.teacher_checkpoint

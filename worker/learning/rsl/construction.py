@@ -20,24 +20,24 @@ from tensordict import TensorDict
 from torch import nn
 
 from shared_store.contract.error_text import Refused, kind_of
-from worker.learning.algorithm import Setting, Share, Spaces
-from worker.learning.rsl.environment import as_floats
+from worker.learning.algorithm import LearningSetting, Spaces, WorldShare
+from worker.learning.rsl.vector_environment import as_floats
 from worker.settings.errors import is_out_of_memory
 from worker.settings.rsl_rl import NETWORKS, RslRlConfig
 from worker.settings.rsl_rl_checks import check_gradient_length, check_networks
 
 
-class Surroundings(VecEnv):
+class ConstructionEnvironment(VecEnv):
     """The environment that rsl_rl needs to build an algorithm. A symmetry function receives it as ``env``."""
 
-    def __init__(self, setting: Setting, example: TensorDict) -> None:
+    def __init__(self, setting: LearningSetting, example: TensorDict) -> None:
         self.num_envs, self.num_actions = setting.share.count, setting.spaces.actions
         self.device, self.step_dt = setting.gang.device, setting.control_seconds
         self.cfg: dict[str, Any] = {}
         self._example = example
 
     @property
-    def unwrapped(self) -> Surroundings:
+    def unwrapped(self) -> ConstructionEnvironment:
         """This object, since rsl_rl looks for ``step_dt`` behind wrappers."""
         return self
 
@@ -90,7 +90,7 @@ def build_network(
     return network
 
 
-def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[str], list[str]]:
+def build_algorithm(config: RslRlConfig, setting: LearningSetting) -> tuple[Any, list[str], list[str]]:
     """rsl_rl's algorithm, the observation groups of its policy, and all groups that it needs. Raises ValueError for impossible settings."""
     spaces, gang = setting.spaces, setting.gang
     if spaces.discrete:
@@ -115,7 +115,7 @@ def build_algorithm(config: RslRlConfig, setting: Setting) -> tuple[Any, list[st
     }
     try:
         with _quiet():
-            built = found.construct_algorithm(example, Surroundings(setting, example), complete, gang.device)
+            built = found.construct_algorithm(example, ConstructionEnvironment(setting, example), complete, gang.device)
     except Exception as error:
         for name in names if not is_out_of_memory(error) else ():  # was it one of them?
             try:
@@ -141,7 +141,7 @@ def _check_numbers(found: Any, section: dict[str, Any]) -> None:
             raise ValueError(f"rsl_rl.algorithm.{name}: expected {expected}, found {kind_of(given)}")
 
 
-def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> None:
+def _check(built: Any, names: tuple[str, str], setting: LearningSetting, steps: int) -> None:
     """Refuse settings on which rsl_rl would only fail while it learns."""
     networks = [getattr(built, name) for name in names if hasattr(built, name)]
     for name, network in zip(names, networks, strict=False):
@@ -149,7 +149,7 @@ def _check(built: Any, names: tuple[str, str], setting: Setting, steps: int) -> 
             raise ValueError(
                 f"rsl_rl.{name}.obs_normalization: it sees images alone, which are not normalised; set false"
             )
-    worlds = min(Share.of(rank, setting.gang.size, setting.share.total).count for rank in range(setting.gang.size))
+    worlds = min(WorldShare.of(rank, setting.gang.size, setting.share.total).count for rank in range(setting.gang.size))
     if isinstance(built, PPO):
         if networks[0].distribution is None:
             raise ValueError("rsl_rl.actor.distribution_cfg: PPO needs a distribution to draw actions from")

@@ -12,7 +12,7 @@ from torch import nn
 
 from worker.learning.algorithm import ExportedPolicy, Spaces
 from worker.learning.observations import made_up, to_numbers
-from worker.learning.rsl.environment import as_floats
+from worker.learning.rsl.vector_environment import as_floats
 
 
 class RslRlPolicy:
@@ -82,7 +82,7 @@ class RslRlPolicy:
         states = list(zip(network.input_names, network.get_dummy_inputs(), strict=True))[1 + len(images) :]
         remembered = {name.removesuffix("_in"): state.transpose(0, 1).contiguous() for name, state in states}
         return ExportedPolicy(
-            network=_Exported(network, vectors, images).eval(),
+            network=_OnnxModule(network, vectors, images).eval(),
             inputs={**inputs, **remembered},
             outputs=["actions", *(f"{name}_out" for name in remembered)],
             sample=made_up(
@@ -91,7 +91,7 @@ class RslRlPolicy:
         )
 
 
-class _Exported(nn.Module):
+class _OnnxModule(nn.Module):
     """rsl_rl's module for ONNX, which takes all vectors as one, then images of floats, then the recurrent state, layers first."""
 
     def __init__(self, network: nn.Module, vectors: Sequence[int], images: Sequence[int]) -> None:

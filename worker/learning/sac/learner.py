@@ -10,12 +10,12 @@ import torch
 from torch import nn
 from torch.nn.functional import log_softmax
 
-from worker.learning.algorithm import Share
+from worker.learning.algorithm import WorldShare
 from worker.learning.distributed import Gang
 from worker.learning.optimizers import load_optimizer
 from worker.learning.sac import kernels
-from worker.learning.sac.networks import Actor, Critics, make_normalizer
-from worker.learning.sac.replay import Batch
+from worker.learning.sac.networks import Critics, SquashedGaussianActor, make_normalizer
+from worker.learning.sac.replay_buffer import Batch
 from worker.settings.sac import SACConfig
 
 BETAS = (0.9, 0.95)
@@ -40,7 +40,7 @@ class Learner:
 
     def __init__(self, config: SACConfig, sizes: Sequence[int], actions: int, gang: Gang) -> None:
         self.config, self._actions, device = config, actions, gang.device
-        self.actor = Actor(config, sizes[0], actions).to(device)
+        self.actor = SquashedGaussianActor(config, sizes[0], actions).to(device)
         self.critics = Critics(config, sizes[-1], actions).to(device)
         for parameter in (*self.actor.parameters(), *self.critics.parameters()):
             gang.broadcast(parameter.data)
@@ -53,7 +53,7 @@ class Learner:
         """Columns of the groups in a row of all observations."""
         self.width = ends[-1]
         self.log_temperature = nn.Parameter(torch.tensor(config.init_temperature, device=device).log())
-        self.samples = Share.of(gang.rank, gang.size, config.batch_size).count
+        self.samples = WorldShare.of(gang.rank, gang.size, config.batch_size).count
         """This rank's share of a batch."""
         self._projected = torch.zeros(self.samples, config.atoms, device=device)
         self.mass = torch.zeros((), device=device)

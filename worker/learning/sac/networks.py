@@ -42,7 +42,7 @@ def hidden_layers(sizes: Sequence[int], layer_norm: bool) -> Iterator[nn.Module]
         yield nn.SiLU()
 
 
-class Actor(nn.Module):
+class SquashedGaussianActor(nn.Module):
     """A Gaussian, squashed into the action's limits by tanh (arXiv:1812.05905, appendix C), with its normaliser inside."""
 
     def __init__(self, config: SACConfig, observations: int, actions: int) -> None:
@@ -161,7 +161,7 @@ class Critics(nn.Module):
 class SquashedPolicy:
     """The learnt policy of SAC: the squashed mean action."""
 
-    def __init__(self, actor: Actor) -> None:
+    def __init__(self, actor: SquashedGaussianActor) -> None:
         self.actor = actor
 
     @torch.no_grad()
@@ -192,7 +192,7 @@ class SquashedPolicy:
 class _Best(nn.Module):
     """The mean action as a separate module, on the CPU."""
 
-    def __init__(self, actor: Actor) -> None:
+    def __init__(self, actor: SquashedGaussianActor) -> None:
         super().__init__()
         self.actor = copy.deepcopy(actor).cpu()
         self.eval()

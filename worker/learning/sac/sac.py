@@ -23,13 +23,13 @@ import torch
 from tensordict import TensorDict
 
 from worker.learning import moments
-from worker.learning.algorithm import POLICY, Setting, Spaces, Transition
+from worker.learning.algorithm import POLICY, LearningSetting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.randomness import mix_seed
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES, Learner
-from worker.learning.sac.networks import Actor, SquashedPolicy, check_spaces, size_of
-from worker.learning.sac.replay import Replay
+from worker.learning.sac.networks import SquashedGaussianActor, SquashedPolicy, check_spaces, size_of
+from worker.learning.sac.replay_buffer import ReplayBuffer
 from worker.settings.sac import SACConfig
 
 SAVED = {"cpu": 64 << 20, "cuda": 4 << 20}
@@ -44,7 +44,7 @@ class SAC:
     captures_rollout: ClassVar[bool] = True
     kernels: ClassVar[tuple[ModuleType, ...]] = (kernels,)
 
-    def __init__(self, config: SACConfig, setting: Setting) -> None:
+    def __init__(self, config: SACConfig, setting: LearningSetting) -> None:
         """Allocate all buffers once. Raises ValueError for images, choices, an unknown group, or a batch without a sample for some rank."""
         self.gang, self.share, self.seed, spaces = setting.gang, setting.share, setting.seed, setting.spaces
         check_spaces(spaces, (POLICY, config.critic_group))
@@ -57,7 +57,7 @@ class SAC:
         sizes = [size_of(spaces, group) for group in self._groups]
         self.learner = Learner(config, sizes, spaces.actions, self.gang)
         width = self.learner.width
-        self.replay = Replay(
+        self.replay = ReplayBuffer(
             config.replay_steps, self.share.count, width, spaces.actions, config.n_step, config.gamma, self.device
         )
         if setting.rehearsal:
@@ -247,7 +247,7 @@ class SAC:
     def build_policy(cls, config: SACConfig, spaces: Spaces, device: str) -> SquashedPolicy:
         """A policy that can load the ``policy`` of a :meth:`state_dict`."""
         check_spaces(spaces, (POLICY,))
-        return SquashedPolicy(Actor(config, size_of(spaces, POLICY), spaces.actions).to(device))
+        return SquashedPolicy(SquashedGaussianActor(config, size_of(spaces, POLICY), spaces.actions).to(device))
 
     def state_dict(self) -> Mapping[str, Any]:
         """Networks, normalisers, temperature, optimizers, and the number of updates."""

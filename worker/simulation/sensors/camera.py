@@ -14,7 +14,12 @@ import warp as wp
 from newton.sensors import SensorCamera
 
 from shared_store.contract.error_text import nearest
-from worker.simulation.camera import (
+from worker.simulation.episodes import EpisodeArrays, random_stream
+from worker.simulation.robot_arrays import BodyArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
+from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.world_cameras import (
     displace,
     displaced,
     draw_light,
@@ -25,11 +30,6 @@ from worker.simulation.camera import (
     shapes_of_worlds,
     to_byte,
 )
-from worker.simulation.episodes import EpisodeArrays, random_stream
-from worker.simulation.robot_arrays import BodyArrays
-from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext, views_of
 
 if TYPE_CHECKING:
     from worker.settings.task import Randomization
@@ -278,7 +278,7 @@ class CameraSensor:
         Raises:
             ValueError: The body, site, robot or object is unknown, or a pattern matches several.
         """
-        place = Place("world", -1, wp.transform_identity())
+        place = BodyFrame("world", -1, wp.transform_identity())
         if self.body is not None or self.site is not None:
             place = only_one(find_places(context, "CameraSensor", self.robot, self.body, self.site), "CameraSensor")
         return Camera(self, place, context)
@@ -301,7 +301,7 @@ class Camera:
 
     needs_bodies = False  # only after resets, where the task sees to it
 
-    def __init__(self, declared: CameraSensor, place: Place, context: SensorContext) -> None:
+    def __init__(self, declared: CameraSensor, place: BodyFrame, context: SensorContext) -> None:
         self.names = tuple(declared.rows(context.views))
         self.declared, self._bodies, self._episodes = declared, context.bodies, context.episodes
         self._worlds, self._device, self._body = context.worlds, context.device, place.body

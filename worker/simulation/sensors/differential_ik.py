@@ -15,7 +15,7 @@ import warp as wp
 from shared_store.contract.error_text import nearest
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.ik_kernels import Chain, IkArrays, begin_targets, move_frame
-from worker.simulation.sensors.places import Place, find_places, only_one, place_names
+from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names
 from worker.simulation.sensors.sensor import SensorContext, views_of
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
@@ -176,7 +176,7 @@ class IkSolver:
 
     needs_bodies = True
 
-    def __init__(self, declared: DifferentialIK, place: Place, context: SensorContext) -> None:
+    def __init__(self, declared: DifferentialIK, place: BodyFrame, context: SensorContext) -> None:
         self.names = tuple(declared.rows(context.views))
         self._worlds, self._bodies, self._device = context.worlds, context.bodies, context.device
         self._robot, self._episodes = context.robots[declared.robot], context.episodes

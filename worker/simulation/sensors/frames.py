@@ -11,7 +11,7 @@ import warp as wp
 
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose, place_velocity
+from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose, place_velocity
 from worker.simulation.sensors.sensor import SensorContext, views_of
 
 wp.set_module_options({"enable_backward": False})
@@ -98,13 +98,13 @@ class Frames:
         places = find_places(context, "Frames", self.robot, self.bodies, self.sites)
         return FrameSensor(places, self._reference(context), context)
 
-    def _reference(self, context: SensorContext) -> Place:
+    def _reference(self, context: SensorContext) -> BodyFrame:
         if self.relative_to is None and self.relative_to_site is None:
             if self.reference_robot is not None:
                 raise ValueError(
                     "Frames.reference_robot: name its body as relative_to, or its site as relative_to_site"
                 )
-            return Place("world", -1, wp.transform_identity())
+            return BodyFrame("world", -1, wp.transform_identity())
         if self.relative_to is not None and self.relative_to_site is not None:
             raise ValueError("Frames: give either relative_to, a body, or relative_to_site, and not both")
         owner = self.robot if self.reference_robot is None else self.reference_robot
@@ -123,7 +123,7 @@ class FrameSensor:
 
     needs_bodies = True
 
-    def __init__(self, places: list[Place], reference: Place, context: SensorContext) -> None:
+    def __init__(self, places: list[BodyFrame], reference: BodyFrame, context: SensorContext) -> None:
         self.names = tuple(place.name for place in places)
         self._bodies, self._device = context.bodies, context.device
         self._shape = (context.worlds.world_count, len(places))

@@ -14,7 +14,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import Place, find_places, place_names, place_pose
+from worker.simulation.sensors.places import BodyFrame, find_places, place_names, place_pose
 from worker.simulation.sensors.sensor import SensorContext, views_of
 from worker.simulation.terrain_arrays import TerrainArrays, flat_ground, ground_height
 
@@ -217,7 +217,7 @@ class HeightScanSensor:
 
     needs_bodies = True
 
-    def __init__(self, declaration: HeightScan, places: list[Place], context: SensorContext) -> None:
+    def __init__(self, declaration: HeightScan, places: list[BodyFrame], context: SensorContext) -> None:
         pattern = declaration.pattern.points()
         self.names = tuple(f"{place.name} {x:+.2f} {y:+.2f}" for place in places for x, y in pattern)
         self._context = context

@@ -12,7 +12,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose, place_velocity
+from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose, place_velocity
 from worker.simulation.sensors.sensor import SensorContext, views_of
 
 wp.set_module_options({"enable_backward": False})
@@ -193,7 +193,7 @@ class ImuSensor:
 
     needs_bodies = True
 
-    def __init__(self, place: Place, context: SensorContext) -> None:
+    def __init__(self, place: BodyFrame, context: SensorContext) -> None:
         self.names = (place.name,)
         self._place, self._bodies, self._device = place, context.bodies, context.device
         self._episodes: EpisodeArrays = context.episodes
@@ -238,7 +238,7 @@ def _dynamics(solver: Any, timestep: float) -> _Dynamics:
     return dynamics
 
 
-def _chain(place: Place, solver: Any) -> list[int]:
+def _chain(place: BodyFrame, solver: Any) -> list[int]:
     """The solver's bodies from the root of the tree to the body of the place."""
     columns = solver.mjc_body_to_newton.numpy()[0].tolist()
     if place.body not in columns[1:]:

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 @dataclass(frozen=True)
-class Place:
+class BodyFrame:
     """A frame on a body.
 
     Attributes:
@@ -36,7 +36,7 @@ def find_places(
     robot: str,
     bodies: str | Iterable[str] | None,
     sites: str | Iterable[str] | None,
-) -> list[Place]:
+) -> list[BodyFrame]:
     """The frames of bodies or of sites.
 
     Args:
@@ -54,12 +54,13 @@ def find_places(
     view = context.view(robot, f"{what}.robot")
     if sites is not None:
         return [
-            Place(view.site_names[index], view.site_bodies[index], view.site_poses[index])
+            BodyFrame(view.site_names[index], view.site_bodies[index], view.site_poses[index])
             for index in view.find_sites(sites)
         ]
     assert bodies is not None  # as was checked above
     return [
-        Place(view.body_names[index], view.bodies[index], wp.transform_identity()) for index in view.find_bodies(bodies)
+        BodyFrame(view.body_names[index], view.bodies[index], wp.transform_identity())
+        for index in view.find_bodies(bodies)
     ]
 
 
@@ -97,7 +98,7 @@ def place_names(
     return [names[index] for index in search(patterns)]
 
 
-def only_one(places: list[Place], what: str) -> Place:
+def only_one(places: list[BodyFrame], what: str) -> BodyFrame:
     """The only place. Raises ValueError where a pattern matches several."""
     if len(places) != 1:
         raise ValueError(f"{what}: name one body or site; the pattern matches {', '.join(p.name for p in places)}")

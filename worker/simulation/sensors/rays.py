@@ -11,13 +11,13 @@ import numpy as np
 import torch
 import warp as wp
 
-from worker.simulation.camera import renderer
 from worker.simulation.kinematics import yaw_quaternion
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import ALIGNMENTS, FEW_POINTS, GridPattern, RingPattern
-from worker.simulation.sensors.places import Place, find_places, only_one, place_names, place_pose
+from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
 from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.world_cameras import renderer
 
 wp.set_module_options({"enable_backward": False})
 
@@ -175,7 +175,7 @@ class RayCasting:
 
     needs_bodies = False  # only after resets, where the task sees to it
 
-    def __init__(self, declared: RayCaster, place: Place, context: SensorContext) -> None:
+    def __init__(self, declared: RayCaster, place: BodyFrame, context: SensorContext) -> None:
         self.names = tuple(declared.rows(context.views))
         self._worlds, self._bodies, self._device = context.worlds, context.bodies, context.device
         mount = wp.transform(wp.vec3(*declared.position), wp.quat_identity())

@@ -89,7 +89,7 @@ class Sensor(Protocol):
         """Live views of the state that the next step reads, by name, each with leading dimension ``worlds``."""
 
 
-class Declaration(Protocol):
+class SensorDeclaration(Protocol):
     """Declaration of a sensor: an immutable value without arrays.
 
     Attributes:

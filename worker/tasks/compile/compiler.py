@@ -17,7 +17,7 @@ import warp as wp
 
 from worker.tasks.compile.binding import Bound
 from worker.tasks.compile.observing import group_function
-from worker.tasks.compile.plan import Plan, Told
+from worker.tasks.compile.plan import KernelPlan, Told
 from worker.tasks.compile.source import Source, call_of, calls, loop, parameters_of
 from worker.tasks.declare.declaration import Event, Reward, Termination
 
@@ -46,7 +46,7 @@ class Kernels:
         source: The source of all of them.
     """
 
-    def __init__(self, name: str, plan: Plan, apart: bool) -> None:
+    def __init__(self, name: str, plan: KernelPlan, apart: bool) -> None:
         source = Source(plan)
         self.structs = source.structs
         text = [act(source)]
@@ -62,7 +62,7 @@ class Kernels:
         self.observe, self.startup = found.get("observe"), found.get("startup")
 
 
-def happening(plan: Plan, when: str) -> list[Bound]:
+def happening(plan: KernelPlan, when: str) -> list[Bound]:
     """The events at a reset, or at startup."""
     return [
         event.bound for event in plan.events if isinstance(event.bound.term, Event) and event.bound.term.when == when
@@ -152,13 +152,13 @@ def judge(source: Source, apart: bool) -> str:
     return kernel("judge", own(plan), source, lines)
 
 
-def own(plan: Plan) -> str:
+def own(plan: KernelPlan) -> str:
     """Parameters of the observing kernels: mode, longest age, the rows of groups besides the policy's, and the common ones."""
     rows = [row for group in further(plan) for row in rows_of(group)]
     return "".join(["mode: int, max_age: int, ", *[f"{row}: wp.array2d[wp.float32], " for row in rows], COMMON])
 
 
-def further(plan: Plan) -> list[str]:
+def further(plan: KernelPlan) -> list[str]:
     """The groups besides the policy's."""
     return [group for group in plan.groups if group != "policy"]
 
@@ -200,7 +200,7 @@ def terminations(source: Source) -> list[str]:
     return [*lines, *(["if valid:", *indent(body)] if body else [])]
 
 
-def cuts(plan: Plan) -> list[Bound]:
+def cuts(plan: KernelPlan) -> list[Bound]:
     """The terminations that count as time-outs."""
     return [bound for bound in plan.terminations if isinstance(bound.term, Termination) and bound.term.time_out]
 
@@ -251,7 +251,7 @@ def totals(source: Source, bounds: list[Bound], some: list[Bound]) -> list[str]:
     return lines
 
 
-def remember_actions(plan: Plan, value: str) -> list[str]:
+def remember_actions(plan: KernelPlan, value: str) -> list[str]:
     """Shift the actions of the last steps."""
     count = "episodes.actions.shape[1]"
     return [
@@ -261,7 +261,7 @@ def remember_actions(plan: Plan, value: str) -> list[str]:
     ]
 
 
-def count_ends(plan: Plan) -> list[str]:
+def count_ends(plan: KernelPlan) -> list[str]:
     """Record and count the cause of the episode's end, if the end counts."""
     first = f"TERMS + {len(plan.rewards) + len(plan.metrics)} + 4"
     lines = []

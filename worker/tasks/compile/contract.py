@@ -18,7 +18,7 @@ from worker.tasks.declare.interface import Interface, Observation
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView
     from worker.simulation.worlds import Worlds
-    from worker.tasks.compile.plan import Column, Driven, Plan, Seen
+    from worker.tasks.compile.plan import Column, Driven, KernelPlan, Seen
 
 UNITS: Mapping[str, tuple[str, str]] = {"effort": ("N m", "N"), "position": ("rad", "m"), "velocity": ("rad/s", "m/s")}
 """Unit of an actuator's input on a revolute joint, and on a prismatic one."""
@@ -30,7 +30,7 @@ Explicit = Mapping[str, Sequence[float]]
 """``stiffness``, ``damping`` and ``effort_limit`` of each actuator of one world, and whether its force is computed ``explicit``ly."""
 
 
-def contract(plan: Plan, worlds: Worlds) -> Interface:
+def contract(plan: KernelPlan, worlds: Worlds) -> Interface:
     """Observations and actions of the policy, in order.
 
     Args:
@@ -61,7 +61,7 @@ def backs(seen: Seen) -> range:
     return range(seen.term.history - 1, -1, -1)
 
 
-def described(plan: Plan, seen: Seen, back: int = 0) -> list[Observation]:
+def described(plan: KernelPlan, seen: Seen, back: int = 0) -> list[Observation]:
     """Description of each column of a term, at the present step or ``back`` steps ago."""
     term, names = seen.term, seen.names
     units = [term.unit] * len(names) if isinstance(term.unit, str) else list(term.unit)
@@ -86,14 +86,14 @@ def described(plan: Plan, seen: Seen, back: int = 0) -> list[Observation]:
     ]
 
 
-def value_of(plan: Plan, column: Column | None, index: int, otherwise: float) -> float:
+def value_of(plan: KernelPlan, column: Column | None, index: int, otherwise: float) -> float:
     """The number that a kernel applies to a column."""
     if column is None:
         return otherwise
     return plan.numbers.values[column.first + (index if column.each else 0)]
 
 
-def _commanded(plan: Plan, seen: Seen, units: list[str]) -> tuple[list[str], list[Any]]:
+def _commanded(plan: KernelPlan, seen: Seen, units: list[str]) -> tuple[list[str], list[Any]]:
     """Units and ranges of a command's columns, if the term uses them all."""
     name = seen.bound.term.parameters.get("command") or next(iter(plan.declaration.commands))
     command: Command = plan.declaration.commands[name]
@@ -103,7 +103,7 @@ def _commanded(plan: Plan, seen: Seen, units: list[str]) -> tuple[list[str], lis
     return (list(command.units) if seen.term.unit == "1" else units), ranges
 
 
-def range_of(plan: Plan, name: str, command: Command, column: str) -> tuple[float, float] | None:
+def range_of(plan: KernelPlan, name: str, command: Command, column: str) -> tuple[float, float] | None:
     """Least and greatest value of a column of a command in training; None if unknown."""
     if column in command.ranges:
         return command.ranges[column]
@@ -111,7 +111,7 @@ def range_of(plan: Plan, name: str, command: Command, column: str) -> tuple[floa
     return (plan.numbers.values[first], plan.numbers.values[first + 1]) if count == 2 else None
 
 
-def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) -> list[Action]:
+def _actions(plan: KernelPlan, driven: Driven, model: Any, motors: Explicit | None) -> list[Action]:
     term = driven.bound.term
     assert isinstance(term, DeclaredAction)
     clip = None
@@ -152,7 +152,9 @@ def _actions(plan: Plan, driven: Driven, model: Any, motors: Explicit | None) ->
     return found
 
 
-def _movements(plan: Plan, driven: Driven, frame: DifferentialIK, clip: tuple[float, float] | None) -> list[Action]:
+def _movements(
+    plan: KernelPlan, driven: Driven, frame: DifferentialIK, clip: tuple[float, float] | None
+) -> list[Action]:
     """One action for each column of a frame that inverse kinematics moves."""
     term = driven.bound.term
     assert isinstance(term, DeclaredAction)

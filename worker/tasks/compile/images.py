@@ -11,7 +11,7 @@ from worker.simulation.robot_view import RobotView
 from worker.tasks.declare.declaration import Declaration
 
 if TYPE_CHECKING:
-    from worker.tasks.compile.plan import Plan
+    from worker.tasks.compile.plan import KernelPlan
 
 
 def cameras(
@@ -66,7 +66,7 @@ def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
             )
 
 
-def shown(plan: Plan, group: str) -> str:
+def shown(plan: KernelPlan, group: str) -> str:
     """Description of a group's images, in one line."""
     sensor = plan.declaration.sensors[plan.images[group]]
     kind = sensor.kind

@@ -12,7 +12,7 @@ from worker.tasks.terms import root
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView
-    from worker.tasks.compile.plan import Plan
+    from worker.tasks.compile.plan import KernelPlan
     from worker.tasks.declare.declaration import Term
 
 _AT_CENTRE_OF_MASS = frozenset({terms.root_com_linear_velocity, terms.root_com_linear_velocity_in_world})
@@ -24,7 +24,7 @@ def is_library(term: Term) -> bool:
     return getattr(terms, term.function_name, None) is term.function
 
 
-def frame_of(plan: Plan, term: Term, sensors: Sequence[str]) -> Frame | None:
+def frame_of(plan: KernelPlan, term: Term, sensors: Sequence[str]) -> Frame | None:
     """The frame of an observation term: of its root or of its inertial measurement unit; None for all others.
 
     Args:

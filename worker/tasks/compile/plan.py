@@ -14,8 +14,8 @@ from worker.simulation.patterns import resolve
 from worker.simulation.robot_view import RobotView
 from worker.tasks.compile.acting import check_action, check_driven
 from worker.tasks.compile.binding import Binder, Bound
-from worker.tasks.compile.checks import check_command, check_observation, check_randomized
 from worker.tasks.compile.contract import described
+from worker.tasks.compile.declaration_checks import check_command, check_observation, check_randomized
 from worker.tasks.compile.images import cameras
 from worker.tasks.compile.numbers import are_times, flat, in_order, is_amount
 from worker.tasks.declare.declaration import (
@@ -120,7 +120,7 @@ class Happening:
     seconds: int = -1
 
 
-class Plan:
+class KernelPlan:
     """The contents of a task's kernels.
 
     Args:

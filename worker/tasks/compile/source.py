@@ -11,7 +11,7 @@ from worker.simulation import episodes as episode_functions
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.worlds import WorldArrays, is_sound, restore_start
 from worker.tasks.compile.binding import Bound
-from worker.tasks.compile.plan import Plan
+from worker.tasks.compile.plan import KernelPlan
 
 _OURS = (
     "STEP",
@@ -37,7 +37,7 @@ class Source:
         structs: Variables of structs, besides those that every kernel has, sorted.
     """
 
-    def __init__(self, plan: Plan) -> None:
+    def __init__(self, plan: KernelPlan) -> None:
         self.plan = plan
         self.structs = [name for name in sorted(plan.binder.structs) if name not in ("worlds", "episodes")]
         self._functions: dict[str, Any] = {}

@@ -15,14 +15,14 @@ from worker.tasks.compile.images import shown
 from worker.tasks.declare.declaration import Adaptive, Choice, Event, Reward, Termination
 
 if TYPE_CHECKING:
-    from worker.tasks.compile.plan import Plan, Seen
+    from worker.tasks.compile.plan import KernelPlan, Seen
 
 Row = dict[str, str]
 _ELSEWHERE = {"rewards", "randomize", "numbers", "curriculum"}
 """Fields of a configuration that are not in the table of its other settings."""
 
 
-def tables(plan: Plan) -> dict[str, list[Row]]:
+def tables(plan: KernelPlan) -> dict[str, list[Row]]:
     """Every non-empty section of a plan, as rows of text by column; all rows of a section have the same columns."""
     found: dict[str, list[Row]] = {"actions": _actions(plan)}
     for group, seen in plan.groups.items():
@@ -75,7 +75,7 @@ def tables(plan: Plan) -> dict[str, list[Row]]:
     return {section: rows for section, rows in found.items() if rows}
 
 
-def numbers(plan: Plan) -> dict[str, list[float]]:
+def numbers(plan: KernelPlan) -> dict[str, list[float]]:
     """The numbers of every place, as ``config.numbers`` and ``config.curriculum`` name them.
 
     Those of ``randomize`` are as the task declares them; ``config.numbers`` sets them when the worlds are built.
@@ -125,7 +125,7 @@ def _adaptive(rule: Adaptive) -> str:
     return f"{rule.start:g} to {rule.end:g} in {rule.steps} steps, on above a mean {rule.of} of {rule.above:g}{back}"
 
 
-def _actions(plan: Plan) -> list[Row]:
+def _actions(plan: KernelPlan) -> list[Row]:
     if plan.choice:
         assert isinstance(plan.choice.term, Choice)
         return [_term(plan, plan.choice) | {"choices": ", ".join(plan.choice.term.names)}]
@@ -143,7 +143,7 @@ def _actions(plan: Plan) -> list[Row]:
     return rows
 
 
-def _joints(plan: Plan, bound: Bound) -> list[str]:
+def _joints(plan: KernelPlan, bound: Bound) -> list[str]:
     """Names of the joints that an action term drives."""
     frame = frame_of(bound, plan.declaration.sensors)
     if frame is None:
@@ -151,7 +151,7 @@ def _joints(plan: Plan, bound: Bound) -> list[str]:
     return [plan.views[frame.robot].joint_names[joint] for joint in frame.driven(plan.views)]
 
 
-def _observation(plan: Plan, seen: Seen) -> Row:
+def _observation(plan: KernelPlan, seen: Seen) -> Row:
     count = len(seen.names)
     noise = _spread(value_of(plan, seen.noise, index, 0.0) for index in range(count)) if seen.noise else ""
     clip = [plan.numbers.values[seen.clip], plan.numbers.values[seen.clip + 1]] if seen.clip is not None else None
@@ -166,7 +166,7 @@ def _observation(plan: Plan, seen: Seen) -> Row:
     }
 
 
-def _reward(plan: Plan, bound: Bound) -> Row:
+def _reward(plan: KernelPlan, bound: Bound) -> Row:
     term = bound.term
     assert isinstance(term, Reward)
     weight = plan.config.rewards[bound.name]
@@ -177,7 +177,7 @@ def _reward(plan: Plan, bound: Bound) -> Row:
     )
 
 
-def _term(plan: Plan, bound: Bound) -> Row:
+def _term(plan: KernelPlan, bound: Bound) -> Row:
     """Name, function, elements and numbers of a term."""
     of = ""
     if bound.elements is not None and not bound.takes("action") and bound.element_names:
@@ -194,7 +194,7 @@ def _plural(bound: Bound) -> str:
     return {"body": "bodies", "index": "columns"}.get(str(element), f"{element}s")
 
 
-def _numbers(plan: Plan, bound: Bound) -> Iterator[str]:
+def _numbers(plan: KernelPlan, bound: Bound) -> Iterator[str]:
     own = {"clip", "scale", "offset", "noise", "seconds"}
     for place, (first, count) in plan.numbers.places.items():
         where, _, name = place.rpartition(".")
@@ -214,7 +214,7 @@ def _spread(values: Iterator[float]) -> str:
     return f"{found[0]:g}" if len(found) == 1 else f"{found[0]:g} to {found[-1]:g}"
 
 
-def _seconds(plan: Plan, first: int) -> str:
+def _seconds(plan: KernelPlan, first: int) -> str:
     least, greatest = plan.numbers.values[first : first + 2]
     return f"{least:g} s" if least == greatest else f"{least:g} to {greatest:g} s"
 

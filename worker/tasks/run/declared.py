@@ -11,7 +11,6 @@ import torch
 import warp as wp
 
 from shared_store.contract.error_text import nearest
-from worker.simulation.camera import paint
 from worker.simulation.capture import on_torch_stream
 from worker.simulation.episodes import STEP, check_group, check_observations
 from worker.simulation.randomization_targets import check_patterns
@@ -23,17 +22,18 @@ from worker.simulation.sensors.differential_ik import IkSolver
 from worker.simulation.sensors.rays import RayCasting
 from worker.simulation.sensors.sensor import SensorContext
 from worker.simulation.terrain import Terrain
-from worker.tasks.compile.checks import placed
+from worker.simulation.world_cameras import paint
 from worker.tasks.compile.compiler import Kernels, further
 from worker.tasks.compile.contract import contract
+from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.compile.numbers import flat
-from worker.tasks.compile.plan import Plan, stacked
+from worker.tasks.compile.plan import KernelPlan, stacked
 from worker.tasks.declare.declaration import Choice, Declaration
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
-from worker.tasks.run.checks import checked_interface
 from worker.tasks.run.step_needs import StepNeeds
 from worker.tasks.run.task import Task
+from worker.tasks.run.task_checks import checked_interface
 from worker.tasks.run.torch_terms import TorchTerms
 from worker.tasks.terms.motion import RecordedMotion
 
@@ -108,7 +108,7 @@ class DeclaredTask(Task):
                 with placed(f"task {type(self).__name__}: sensors.{name}"):
                     sensor.rows(self.views)
         try:
-            self.plan = Plan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
+            self.plan = KernelPlan(self.declaration, config, self.views, sensors, self.ground_terrain is not None)
             check_patterns(self.declaration.randomize, self.views)
             if isinstance(self.ground_terrain, Terrain):
                 self.ground_terrain.check_memory()

@@ -19,7 +19,7 @@ CLOCK = "time_out"
 
 
 @dataclass(frozen=True)
-class Ended:
+class LastEpisodes:
     """The last finished episode of each world: live views, valid in every world that has finished one.
 
     Attributes:
@@ -45,7 +45,7 @@ class Ended:
     final: Sequence[str] = ()
 
     @classmethod
-    def of(cls, task: Task, buffer: Callable[[str, tuple[int, ...], Any], torch.Tensor]) -> Ended:
+    def of(cls, task: Task, buffer: Callable[[str, tuple[int, ...], Any], torch.Tensor]) -> LastEpisodes:
         """The records of ``task``, in buffers that ``buffer`` allocates among its ``EpisodeArrays``: name, shape, Warp's type."""
         count = task.world_count
         rewards = [f"reward_{name}" for name in task.reward_terms]

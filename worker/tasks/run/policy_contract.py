@@ -14,7 +14,7 @@ from worker.tasks.compile.tables import settings
 
 if TYPE_CHECKING:
     from worker.simulation.robot_reading import Reading
-    from worker.tasks.compile.plan import Plan, Seen
+    from worker.tasks.compile.plan import KernelPlan, Seen
     from worker.tasks.run.task import Task
 
 CHANNELS = ("red", "green", "blue")
@@ -105,7 +105,7 @@ def _texts(value: Any) -> Any:
 
 def _terms(task: Task, group: str) -> tuple[Term, ...]:
     """The terms of a group of numbers; none if unknown."""
-    plan: Plan | None = getattr(task, "plan", None)
+    plan: KernelPlan | None = getattr(task, "plan", None)
     if plan is None:
         return _columns(task) if group in ("policy", "critic") else ()
     # if the policy sees only an image, the plan has the critic's terms in its place
@@ -139,7 +139,7 @@ def _columns(task: Task) -> tuple[Term, ...]:
     )
 
 
-def _term(plan: Plan, seen: Seen, first: int) -> Term:
+def _term(plan: KernelPlan, seen: Seen, first: int) -> Term:
     columns, bound, term = described(plan, seen), seen.bound, seen.term
     signature = bound.signature
     places = plan.numbers.places
@@ -179,7 +179,7 @@ def _sensor(declared: Any) -> str:
     return ", ".join(filter(None, (type(declared).__name__, settings(declared))))
 
 
-def _commands(plan: Plan | None) -> tuple[Command, ...]:
+def _commands(plan: KernelPlan | None) -> tuple[Command, ...]:
     if plan is None:
         return ()
     found = []
@@ -208,7 +208,7 @@ def same_policy(contract: Contract, of: Contract) -> Contract:
 def images_of(task: Task) -> dict[str, dict[str, Any]]:
     """Description of each image group, as plain values: the camera's settings, and the names of the channels."""
     camera = getattr(task.config, "camera", None)
-    plan: Plan | None = getattr(task, "plan", None)
+    plan: KernelPlan | None = getattr(task, "plan", None)
     found = {"policy": dataclasses.asdict(camera)} if camera is not None else {}
     if plan is None:
         return found

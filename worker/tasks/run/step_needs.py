@@ -7,7 +7,7 @@ from typing import Any
 
 from worker.simulation.sensors.differential_ik import IkSolver
 from worker.tasks.compile.binding import Bound
-from worker.tasks.compile.plan import Plan
+from worker.tasks.compile.plan import KernelPlan
 from worker.tasks.declare.functions import reads_poses
 from worker.tasks.run.torch_terms import TorchTerms
 
@@ -21,7 +21,7 @@ class StepNeeds:
         placed: Poses of bodies again after the reset of worlds: observations or the next step's actions read them.
     """
 
-    def __init__(self, plan: Plan, sensors: Mapping[str, Any], torch_terms: TorchTerms) -> None:
+    def __init__(self, plan: KernelPlan, sensors: Mapping[str, Any], torch_terms: TorchTerms) -> None:
         observed = [seen.bound for group in plan.groups.values() for seen in group]
         acting = [*(driven.bound for driven in plan.driven), *([plan.choice] if plan.choice else [])]
         measured = any(sensor.needs_bodies for sensor in sensors.values())

@@ -12,7 +12,6 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.settings.task import TaskConfig, default_rewards, value_at
-from worker.simulation.camera import Camera
 from worker.simulation.capture import CapturedStep, on_torch_stream
 from worker.simulation.episodes import (
     NO_MISHAP,
@@ -27,12 +26,13 @@ from worker.simulation.episodes import (
 )
 from worker.simulation.randomization import Randomizer
 from worker.simulation.terrain import Terrain
+from worker.simulation.world_cameras import WorldCameras
 from worker.simulation.worlds import Worlds
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
-from worker.tasks.run.checks import assert_replays, check_arguments, noise_of
-from worker.tasks.run.episode_records import Ended
+from worker.tasks.run.episode_records import LastEpisodes
 from worker.tasks.run.saved import check_state, completed
+from worker.tasks.run.task_checks import assert_replays, check_arguments, noise_of
 from worker.tasks.run.task_report import Telling
 
 
@@ -70,7 +70,7 @@ class Task(Telling):
             float64. They are not part of the state: read and clear them before it is saved.
         mishap: A world that failed and was reset since :meth:`clear_statistics`, and the cause: see :meth:`read_mishap`; shape
             ``(1,)``, int32.
-        ended: The last finished episode of each world, see :class:`worker.tasks.run.episode_records.Ended`.
+        ended: The last finished episode of each world, see :class:`worker.tasks.run.episode_records.LastEpisodes`.
         randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
         captured: Whether :meth:`step` replays a graph; true after construction, which captures one on trial.
     """
@@ -162,7 +162,7 @@ class Task(Telling):
         camera = getattr(config, "camera", None)
         with on_torch_stream(self.device):
             self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz, noise)
-            self._camera = Camera(camera, config.randomize, self.worlds, self._episodes) if camera else None
+            self._camera = WorldCameras(camera, config.randomize, self.worlds, self._episodes) if camera else None
             if self._camera:
                 self.observations = self._camera.images
                 self.observation_shape = tuple(self.observations.shape[1:])
@@ -370,7 +370,7 @@ class Task(Telling):
         self.level = buffer("level", (1,), wp.float32)
         self.level.fill_(1.0)
         self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
-        self.ended = Ended.of(self, buffer)
+        self.ended = LastEpisodes.of(self, buffer)
 
     def _group(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
         """The observation groups, and those before the reset. The critic's have buffers of their own only where there is noise."""

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from worker.tasks.compile.binding import Bound
-from worker.tasks.compile.plan import Plan
+from worker.tasks.compile.plan import KernelPlan
 
 if TYPE_CHECKING:
     from worker.tasks.run.declared import DeclaredTask
@@ -30,7 +30,7 @@ class TorchTerms:
         observe_any: Whether any is an observation.
     """
 
-    def __init__(self, task: DeclaredTask, plan: Plan, external: wp.array2d[wp.float32]) -> None:
+    def __init__(self, task: DeclaredTask, plan: KernelPlan, external: wp.array2d[wp.float32]) -> None:
         self._task = task
         self._terms = list({bound.place: bound for bound in plan.terms if bound.signature is None}.values())
         self._seen = [bound for bound in self._terms if bound.place.startswith("observations")]

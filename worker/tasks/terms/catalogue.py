@@ -40,7 +40,7 @@ _NAMES = re.compile(r"^ *mjlab: (.*?)\.\s+Isaac Lab: (.*)\.$", re.DOTALL | re.MU
 
 
 @dataclass(frozen=True)
-class Entry:
+class TermEntry:
     """A term, read from its docstring and signature.
 
     Attributes:
@@ -62,7 +62,7 @@ class Entry:
     isaac_lab: str
 
 
-def entries() -> Iterator[Entry]:
+def entries() -> Iterator[TermEntry]:
     """All terms, module by module in the order of their source."""
     for group in GROUPS:
         module = importlib.import_module(f"worker.tasks.terms.{group}")
@@ -73,7 +73,7 @@ def entries() -> Iterator[Entry]:
                     yield found
 
 
-def _entry(name: str, group: str, function: Any) -> Entry | None:
+def _entry(name: str, group: str, function: Any) -> TermEntry | None:
     text = inspect.getdoc(function.func) or ""
     names = _NAMES.search(text)
     if names is None:  # a function shared by terms
@@ -84,7 +84,7 @@ def _entry(name: str, group: str, function: Any) -> Entry | None:
     given = ", ".join(filter(None, map(_shown, parameters)))
     returns = inspect.signature(function.func).return_annotation
     shown = "" if returns is inspect.Signature.empty else _kind(returns)
-    return Entry(name, group, given, shown, " ".join(meaning.split()), mjlab, isaac_lab)
+    return TermEntry(name, group, given, shown, " ".join(meaning.split()), mjlab, isaac_lab)
 
 
 def _kind(annotation: Any) -> str:

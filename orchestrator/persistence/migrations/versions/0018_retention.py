@@ -5,7 +5,7 @@ import json
 import sqlalchemy as sa
 from alembic import op
 
-from orchestrator.persistence.models import now
+from orchestrator.persistence.batch_models import now
 
 revision = "0018"
 down_revision = "0017"

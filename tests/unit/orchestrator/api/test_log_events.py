@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orchestrator.api.logs import events as log_events
-from orchestrator.api.logs.events import LogFile, View
+from orchestrator.api.logs import log_events
 from orchestrator.api.logs.filter import parse
+from orchestrator.api.logs.log_events import LogFile, LogSnapshot
 from shared_store.volume.logs import format_line
 
 LINES = ["ERROR 404 in trainer", "ERROR in loader", "WARN: loss is nan", "iteration 12/300", 'said "hi" at 50%', "",
@@ -95,13 +95,13 @@ def test_a_poll_near_the_end_reads_only_the_end(tmp_path: Path, monkeypatch: pyt
     path = tmp_path / "node-0.log"
     path.write_text("".join(format_line(1e9 + i / 100, 0, "o", f"line {i} {'x' * 80}") for i in range(100_000)))
     file, read = LogFile(path, "s"), []
-    genuine = View._read
+    genuine = LogSnapshot._read
 
-    def counting(view: View, offset: int, size: int) -> bytes:
+    def counting(view: LogSnapshot, offset: int, size: int) -> bytes:
         read.append(size)
         return genuine(view, offset, size)
 
-    monkeypatch.setattr(View, "_read", counting)
+    monkeypatch.setattr(LogSnapshot, "_read", counting)
     view = file.look()
     found = [event.text.split()[1] for event in view.forward(since=int(1e12) + 999_900)]
     assert found == [str(i) for i in range(99_990, 100_000)]

@@ -12,26 +12,26 @@ from onnx import TensorProto, helper, numpy_helper
 
 from orchestrator.cli.comparison.curves import draw
 from orchestrator.cli.comparison.weights import difference
-from shared_store.volume.comparison import POINTS, RunFacts, grouped
+from shared_store.volume.comparison import POINTS, ComparedRun, grouped
 
 
-def run(name: str, seed: int, rewards: list[float], *, evaluated: float | None = None, **train: Any) -> RunFacts:
+def run(name: str, seed: int, rewards: list[float], *, evaluated: float | None = None, **train: Any) -> ComparedRun:
     spec = {"name": name, "train": {"task": "Ant", "seed": seed, **train}}
     records = [
         {"iteration": i, "env_steps": 10 * i, "reward": reward, "episode_length": 5.0}
         for i, reward in enumerate(rewards, 1)
     ]
     evaluation = None if evaluated is None else {"mean_return": evaluated, "success": {"share": 0.5}}
-    return RunFacts(name, spec, records, evaluation)
+    return ComparedRun(name, spec, records, evaluation)
 
 
 def test_runs_that_differ_in_name_and_seed_alone_are_one_group() -> None:
     alike = [run("ant-a", 1, [1.0]), run("ant-b", 2, [3.0])]
-    groups = grouped([*alike, run("slow", 1, [2.0], worlds=3), RunFacts("bare", {}, [], None)])
+    groups = grouped([*alike, run("slow", 1, [2.0], worlds=3), ComparedRun("bare", {}, [], None)])
     assert [group.label for group in groups] == ["ant-* (2)", "slow", "bare"]
     assert groups[0].describe()["seeds"] == [1, 2]
     assert groups[0].describe()["reward"] == {"mean": 2.0, "std": pytest.approx(2**0.5)}
-    bare = grouped([RunFacts("a", {}, [], None), RunFacts("b", {}, [], None)])
+    bare = grouped([ComparedRun("a", {}, [], None), ComparedRun("b", {}, [], None)])
     assert bare[1].label == "b", "nothing says that they are alike"
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from orchestrator.cli.catalogue import ENTRIES, load
-from orchestrator.cli.misuse import Group
+from orchestrator.cli.misuse import CommandGroup
 from tests.conftest import call_muster
 
 MISUSE = {
@@ -61,7 +61,7 @@ def groups() -> list[tuple[str, Any]]:
 
 def test_every_group_refuses_unknown_commands_alike_and_every_command_has_an_example_and_a_summary() -> None:
     assert {name for name, _ in groups()} >= {"models", "keys", "webhooks", "aws"}
-    assert [name for name, command in groups() if not isinstance(command, Group)] == []
+    assert [name for name, command in groups() if not isinstance(command, CommandGroup)] == []
     every = [(entry.name, load(entry.name)) for entry in ENTRIES]
     every += [(f"{name} {own}", each) for name, group in groups() for own, each in group.commands.items()]
     without = [name for name, command in every if "xample" not in (command.epilog or "") or not command.help]

@@ -15,7 +15,7 @@ from fastapi import Request
 
 from orchestrator.api.http.access import Access
 from orchestrator.console import job, live
-from orchestrator.console.live import Event, Recent, Rows, last_id, stream
+from orchestrator.console.live import Recent, ServerSentEvent, TableRows, last_id, stream
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run, Store
@@ -33,7 +33,7 @@ def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
     return cast(Request, told)
 
 
-def written(looks: Sequence[Callable[[], Sequence[Event] | None]]) -> list[str]:
+def written(looks: Sequence[Callable[[], Sequence[ServerSentEvent] | None]]) -> list[str]:
     """The blocks of a stream whose looks find these."""
     left: Iterator[Callable[[], Any]] = iter(looks)
 
@@ -45,7 +45,7 @@ def written(looks: Sequence[Callable[[], Sequence[Event] | None]]) -> list[str]:
 
 
 def test_of_a_table_only_what_changed_is_sent() -> None:
-    table = Rows()
+    table = TableRows()
     (first,) = table.changes({"a": {"x": "1", "y": "2"}, "b": {"x": "3", "y": "4"}}, {"shown": "2"})
     assert first.data["order"] == ["a", "b"] and first.data["rows"]["b"] == {"x": "3", "y": "4"}
     assert table.changes({"a": {"x": "1", "y": "2"}, "b": {"x": "3", "y": "4"}}, {"shown": "2"}) == []
@@ -56,7 +56,7 @@ def test_of_a_table_only_what_changed_is_sent() -> None:
 
 
 def test_no_text_can_end_an_event_or_begin_another() -> None:
-    event = Event("rows", {"x": "a\n\ndata: b\r\nevent: c\u2028\x00"}, "7")
+    event = ServerSentEvent("rows", {"x": "a\n\ndata: b\r\nevent: c\u2028\x00"}, "7")
     (_, block) = written([lambda: [event], lambda: None])[:2]
     lines = block.split("\n")
     assert lines[0] == "event: rows" and lines[2] == "id: 7" and len(lines) == 3
@@ -64,10 +64,10 @@ def test_no_text_can_end_an_event_or_begin_another() -> None:
 
 
 def test_a_look_that_fails_is_told_and_the_stream_goes_on_to_its_end() -> None:
-    def failing() -> Sequence[Event]:
+    def failing() -> Sequence[ServerSentEvent]:
         raise ClientError("the run is gone")
 
-    blocks = written([failing, lambda: [Event("a", 1)], lambda: None])
+    blocks = written([failing, lambda: [ServerSentEvent("a", 1)], lambda: None])
     assert [block.split("\n")[0] for block in blocks[1:]] == [
         "event: trouble",
         "event: trouble",

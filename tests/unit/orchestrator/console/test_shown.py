@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from orchestrator.console import formats as words
 from orchestrator.console.curves import columns, curves_of, number
 from orchestrator.console.job_config import code_of, differences
-from orchestrator.console.lineage import Drawing, drawing
+from orchestrator.console.lineage import LineageGraph, drawing
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import MetricsWriter
 
@@ -123,7 +123,7 @@ def version(number: int, run: str, parent: dict[str, Any] | None = None) -> dict
     return {"name": "fast", "version": number, "run": run, "iteration": 9, "parent": parent, "score": 2.0}
 
 
-def drawn(*versions: dict[str, Any], **parents: str) -> Drawing:
+def drawn(*versions: dict[str, Any], **parents: str) -> LineageGraph:
     found = {run: {"run": parent, "iteration": 5} for run, parent in parents.items()}
     return drawing(versions, 1, found.get)
 

@@ -7,8 +7,8 @@ from dataclasses import replace
 import pytest
 
 from orchestrator.console.forms import Form
-from orchestrator.console.submit_fields import Group, document, filled, groups, tasks, written
-from orchestrator.console.submit_help import Problem, help_at, problem_of
+from orchestrator.console.submit_fields import FieldGroup, document, filled, groups, tasks, written
+from orchestrator.console.submit_help import SubmissionProblem, help_at, problem_of
 from orchestrator.spec.file import from_text
 
 
@@ -22,7 +22,7 @@ def test_the_wizard_of_every_task_begins_with_a_job_that_can_be_submitted() -> N
 
 
 def test_settings_of_an_algorithm_that_is_not_chosen_are_left_out() -> None:
-    def given(group: Group) -> Group:
+    def given(group: FieldGroup) -> FieldGroup:
         values = {"train.algorithm": "sac", "train.ppo.gamma": "0.9", "train.sac.gamma": "0.8"}
         return replace(group, fields=tuple(replace(each, value=values.get(each.name, "")) for each in group.fields))
 
@@ -77,7 +77,7 @@ def test_help_says_what_a_key_is_and_which_are_given_also_in_what_is_not_yaml_ye
 
 def test_an_error_has_its_key_and_its_line() -> None:
     found = problem_of("job.yaml:9: train.config.camera.width: expected", JOB)
-    assert found == Problem("expected", "train.config.camera.width", 9)
-    assert problem_of("job.yaml:3: not valid YAML: what", JOB) == Problem("not valid YAML: what", "", 3)
-    assert problem_of("job.yaml: expected a mapping", "") == Problem("expected a mapping")
-    assert problem_of("something: else", "") == Problem("something: else")
+    assert found == SubmissionProblem("expected", "train.config.camera.width", 9)
+    assert problem_of("job.yaml:3: not valid YAML: what", JOB) == SubmissionProblem("not valid YAML: what", "", 3)
+    assert problem_of("job.yaml: expected a mapping", "") == SubmissionProblem("expected a mapping")
+    assert problem_of("something: else", "") == SubmissionProblem("something: else")

@@ -11,7 +11,7 @@ import pytest
 from orchestrator.control.account import DEFAULT, Account, recognise
 from orchestrator.control.compute_environments import ensure_compute_environments
 from orchestrator.domain.errors import UsageError
-from orchestrator.persistence.models import Job, JobDefinition, JobQueue
+from orchestrator.persistence.batch_models import Job, JobDefinition, JobQueue
 from orchestrator.persistence.own_models import LogGroup
 from orchestrator.persistence.session import Database
 from orchestrator.services import arns

@@ -16,8 +16,8 @@ from orchestrator.control import kept_texts
 from orchestrator.control.kept_texts import DAYS, KeptTexts, TextRefused
 from orchestrator.domain.errors import Unavailable
 from orchestrator.domain.job import Status
-from orchestrator.persistence import models
-from orchestrator.persistence.models import Job, JobDefinition
+from orchestrator.persistence import batch_models
+from orchestrator.persistence.batch_models import Job, JobDefinition
 from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.session import Database
 from orchestrator.spec.compile import compile_definition, long_texts
@@ -55,8 +55,8 @@ def kept(store: Store) -> list[str]:
 
 def later(monkeypatch: pytest.MonkeyPatch, days: float) -> None:
     """Let days pass."""
-    moment = models.now() + int(days * 24 * 3600 * 1000)
-    for module in (models, kept_texts):
+    moment = batch_models.now() + int(days * 24 * 3600 * 1000)
+    for module in (batch_models, kept_texts):
         monkeypatch.setattr(module, "now", lambda: moment)
 
 

@@ -18,7 +18,7 @@ from orchestrator.control import log_hub, log_tail
 from orchestrator.control.log_hub import LogHub, Waker
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
 from shared_store.volume import log_view
 from shared_store.volume.layout import Run

@@ -15,11 +15,11 @@ from sqlalchemy import select
 
 from orchestrator.control import retention as module
 from orchestrator.control.retention import RunNeeded
-from orchestrator.control.retention_looks import Place, Whose
+from orchestrator.control.retention_looks import PassCursor, Whose
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY
-from orchestrator.persistence import references
-from orchestrator.persistence.models import (
+from orchestrator.persistence import retention_rows
+from orchestrator.persistence.batch_models import (
     Attempt,
     Dependency,
     JobDefinition,
@@ -158,14 +158,14 @@ def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkey
         world.ended(f"j{number:02}", stopped_at=LONG_AGO + number // 5)
         if number % 4 == 0:
             contents.archive(world.store.run(f"j{number:02}"), "key a")
-    place: Place | None = Place()
+    place: PassCursor | None = PassCursor()
     seen: list[str] = []
     while place is not None:
         looks, place = world.step(place, take=False, most=3)
-        place = None if place is None else Place.of(str(place))
+        place = None if place is None else PassCursor.of(str(place))
         seen += [each["run"] for each in looks]
     assert sorted(seen) == [f"j{number:02}" for number in range(17)]
-    place = Place()
+    place = PassCursor()
     while place is not None:
         _, place = world.step(place, take=True, most=3)
     assert world.jobs() == world.runs() == [f"j{number:02}" for number in range(0, 17, 4)]
@@ -215,7 +215,7 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
         patched.setattr("shared_store.volume.trash.os.rename", dying(os.rename))
         patched.setattr("shared_store.volume.trash.sync_directory", dying(sync_directory))
         patched.setattr("shared_store.volume.trash.shutil.rmtree", dying(shutil.rmtree))
-        patched.setattr("orchestrator.persistence.references.forget_jobs", dying(references.forget_jobs))
+        patched.setattr("orchestrator.persistence.retention_rows.forget_jobs", dying(retention_rows.forget_jobs))
         try:
             world.retention().take_all()
         except Killed:

@@ -12,7 +12,7 @@ import pytest
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention, RunNeeded
 from orchestrator.control.run_users import RunInUse
-from orchestrator.persistence.models import Dependency
+from orchestrator.persistence.batch_models import Dependency
 from orchestrator.services.context import using
 from shared_store.volume import contents, epoch, trash
 from shared_store.volume.epoch import Claim

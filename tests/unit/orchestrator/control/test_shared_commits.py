@@ -14,7 +14,7 @@ from orchestrator.control.isolation import Isolation
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job, JobQueue, SchedulingPolicy
+from orchestrator.persistence.batch_models import Job, JobQueue, SchedulingPolicy
 from orchestrator.persistence.own_models import ShareUsage
 from orchestrator.persistence.session import Database, DatabaseError
 from tests.support.orchestrator.fake_controller import FakeController, properties

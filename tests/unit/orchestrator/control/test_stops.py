@@ -17,7 +17,7 @@ from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.api import EngineError, GangStatus, Handle, read_handle
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.queries import ask_to_end
 from tests.support.orchestrator.fake_controller import FakeController
 from tests.support.waiting import wait_for

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from orchestrator.control.store_identity import StoreIdentity, recognise
-from orchestrator.persistence.models import Attempt
+from orchestrator.persistence.batch_models import Attempt
 from orchestrator.persistence.session import Database
 from shared_store.volume.layout import Store, StoreError
 from tests.support.orchestrator.rows import job

@@ -11,7 +11,7 @@ import pytest
 
 from orchestrator.control.deliveries import _evaluated
 from orchestrator.control.webhooks import PAUSES, Webhook, WebhooksError, kind_of, read_webhooks, run_of
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from shared_store.volume.files import write_json
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.receiver import SECRET, write_webhooks

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.domain.attempt import CAUSE_PATIENCE, FINISHING, SHORTEST_REQUEUE, UNHEARD, State, Terms, step
+from orchestrator.domain.attempt import CAUSE_PATIENCE, FINISHING, SHORTEST_REQUEUE, UNHEARD, AttemptState, Terms, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -51,25 +51,27 @@ T = 1_000_000
 NATIVE = NativeOptions(is_native=True, on_child_failure="restart")
 TERMS = Terms(number=2, hosts=("h/0", "h/1"), whole=2, main=0, options=NATIVE, grace=30.0, allowed=3, spent=1)
 
-PREPARING = State(TERMS)
+PREPARING = AttemptState(TERMS)
 LAUNCHING = replace(PREPARING, prepared=True)
 STARTING = replace(LAUNCHING, launched=True)
 RUNNING = replace(STARTING, started=True, running_since=T - 50_000)
 
 
-def ending(ending: Ending, reason: str = "why", exit_code: int | None = None, of: State = RUNNING) -> State:
+def ending(
+    ending: Ending, reason: str = "why", exit_code: int | None = None, of: AttemptState = RUNNING
+) -> AttemptState:
     return replace(of, verdict=Verdict(ending, reason, exit_code))
 
 
-def with_terms(state: State, **terms: Any) -> State:
+def with_terms(state: AttemptState, **terms: Any) -> AttemptState:
     return replace(state, terms=replace(state.terms, **terms))
 
 
-def asked(state: State) -> State:
+def asked(state: AttemptState) -> AttemptState:
     return replace(state, stop_reason="enough")
 
 
-def on_aws(state: State) -> State:
+def on_aws(state: AttemptState) -> AttemptState:
     return with_terms(state, options=NativeOptions())
 
 
@@ -124,7 +126,7 @@ def ending_so(reason: str = "why") -> Instruction:
 
 TIMED = with_terms(RUNNING, timeout=50)
 
-RULES: dict[str, tuple[State, Event, Sequence[Instruction]]] = {
+RULES: dict[str, tuple[AttemptState, Event, Sequence[Instruction]]] = {
     # -- preparing
     "a new attempt takes its run": (PREPARING, Due(), [Prepare()]),
     "its epoch is saved before anything is launched": (PREPARING, Prepared(7), [TakeEpoch(7), Save(), Launch()]),
@@ -317,11 +319,11 @@ REQUEUE, STOP = Ending.REQUEUE, Ending.STOPPED
 CODE_4 = {"action": "EXIT", "onExitCode": "4"}
 
 
-def ran(state: State, milliseconds: int) -> State:
+def ran(state: AttemptState, milliseconds: int) -> AttemptState:
     return replace(state, running_since=T - milliseconds)
 
 
-def final(code: int, condition: dict[str, str]) -> State:
+def final(code: int, condition: dict[str, str]) -> AttemptState:
     return with_terms(ending(Ending.FAILED, exit_code=code), conditions=[condition])
 
 
@@ -341,7 +343,7 @@ STOPPED_LATE = "done before it was stopped"
 FAULT, OTHER = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"
 
 
-def faulty(before: str | None, now: str | None = FAULT, **terms: Any) -> State:
+def faulty(before: str | None, now: str | None = FAULT, **terms: Any) -> AttemptState:
     """The second attempt ends by a fault, and the last spent one ended by ``before``."""
     state = with_terms(ending(Ending.FAILED, exit_code=1), last_fault=before, **terms)
     return replace(state, verdict=replace(FAILED, reason="why", fault=now))
@@ -350,7 +352,7 @@ def faulty(before: str | None, now: str | None = FAULT, **terms: Any) -> State:
 REPEATED_SO = f"why ({FAULT} ended the attempt before, too: not tried again after 2 of 3 attempts; correct it before you resume or submit again)"
 
 # state, the nodes' ends → whether the attempt is spent, the job's state, and its reason
-CLOSES: dict[str, tuple[State, Sequence[NodeEnd | None], bool, Status, str]] = {
+CLOSES: dict[str, tuple[AttemptState, Sequence[NodeEnd | None], bool, Status, str]] = {
     "done": (ending(Ending.SUCCEEDED), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
     "done before the stop": (asked(ending(Ending.SUCCEEDED)), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
     "done before its user stopped it": (asked(ending(STOP)), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from orchestrator.domain.attempt import SHORTEST_REQUEUE, State, Terms, step
+from orchestrator.domain.attempt import SHORTEST_REQUEUE, AttemptState, Terms, step
 from orchestrator.domain.attempt_events import Gone
 from orchestrator.domain.attempt_instructions import Close
 from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict
@@ -16,7 +16,7 @@ T = 1_000_000
 """The moment of every event here (steady time [ms])."""
 NATIVE = NativeOptions(is_native=True, on_child_failure="restart")
 TERMS = Terms(number=2, hosts=("h/0", "h/1"), whole=2, main=0, options=NATIVE, grace=30.0, allowed=3, spent=1)
-ENDING = State(
+ENDING = AttemptState(
     TERMS,
     prepared=True,
     launched=True,

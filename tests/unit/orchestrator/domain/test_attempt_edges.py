@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from orchestrator.domain.attempt import SHORTEST_REQUEUE, Phase, State, Terms, after, step
+from orchestrator.domain.attempt import SHORTEST_REQUEUE, AttemptPhase, AttemptState, Terms, after, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
@@ -37,7 +37,7 @@ from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict
 from orchestrator.domain.native_options import NativeOptions
 
 NATIVE = NativeOptions(is_native=True, on_child_failure="fail")
-PREPARING = State(Terms(1, ("h/0", "h/1"), 2, 0, NATIVE, 30.0))
+PREPARING = AttemptState(Terms(1, ("h/0", "h/1"), 2, 0, NATIVE, 30.0))
 LAUNCHING = replace(PREPARING, prepared=True)
 STARTING = replace(LAUNCHING, launched=True)
 RUNNING = replace(STARTING, started=True, running_since=1000)
@@ -46,8 +46,8 @@ RUNNING = replace(STARTING, started=True, running_since=1000)
 def test_phases_follow_one_another() -> None:
     ending = replace(RUNNING, verdict=Verdict(Ending.FAILED, "why"))
     phases = [each.phase for each in (PREPARING, LAUNCHING, STARTING, RUNNING, ending, replace(ending, closed=True))]
-    assert phases == list(Phase)
-    assert replace(ending, launched=False).phase is Phase.LAUNCHING
+    assert phases == list(AttemptPhase)
+    assert replace(ending, launched=False).phase is AttemptPhase.LAUNCHING
 
 
 def test_a_gang_that_failed_for_good_has_little_to_save() -> None:
@@ -99,4 +99,4 @@ EVENTS = (
 @pytest.mark.parametrize("event", EVENTS, ids=lambda event: type(event).__name__)
 def test_nothing_follows_from_an_event_of_a_closed_attempt(event: Event) -> None:
     closed = replace(RUNNING, verdict=Verdict(Ending.FAILED, "why"), closed=True)
-    assert closed.phase is Phase.CLOSED and step(closed, event) == ()
+    assert closed.phase is AttemptPhase.CLOSED and step(closed, event) == ()

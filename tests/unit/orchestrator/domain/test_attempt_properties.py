@@ -75,15 +75,15 @@ terms = st.builds(
 class Page:
     """An event of a story and what followed from it."""
 
-    before: attempt.State
+    before: attempt.AttemptState
     event: attempt_events.Event
     instructions: attempt_instructions.Instructions
-    now: attempt.State
+    now: attempt.AttemptState
 
 
 def told(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
     """A job's attempts, one after the other."""
-    state, pages = attempt.State(terms), list[Page]()
+    state, pages = attempt.AttemptState(terms), list[Page]()
     for turn in turns:
         events: list[attempt_events.Event] = [attempt_events.Due()]
         if isinstance(turn.before, str):
@@ -110,7 +110,7 @@ def told(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
             if (close := closed(pages[-1])) is not None and close.status is Status.RUNNABLE:  # the next attempt
                 spent = state.terms.spent + close.spent
                 following = replace(state.terms, number=state.terms.number + 1, spent=spent)
-                state, events = attempt.State(following, stop_reason=state.stop_reason), []
+                state, events = attempt.AttemptState(following, stop_reason=state.stop_reason), []
     return pages
 
 
@@ -181,7 +181,7 @@ def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
             assert page.now.verdict is not None, "the next look decides its end"
         if (
             isinstance(page.event, attempt_events.LaunchDelayed)
-            and page.before.phase is attempt.Phase.LAUNCHING
+            and page.before.phase is attempt.AttemptPhase.LAUNCHING
             and not page.event.unknown
         ):
             assert attempt_instructions.WindUp() in page.instructions, "nothing is launched any more"

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from orchestrator.domain.attempt import Phase
+from orchestrator.domain.attempt import AttemptPhase
 from orchestrator.domain.job import (
     AWS_ENDINGS,
     TRANSITIONS,
@@ -60,7 +60,7 @@ def test_an_ended_job_stays_ended_and_every_other_one_can_end() -> None:
 
 def test_databases_of_older_controllers_hold_these_words() -> None:
     assert [each.value for each in Status] == [each.name for each in Status]
-    assert [each.value for each in (*Ending, *Phase)] == [each.name.lower() for each in (*Ending, *Phase)]
+    assert [each.value for each in (*Ending, *AttemptPhase)] == [each.name.lower() for each in (*Ending, *AttemptPhase)]
 
 
 @pytest.mark.parametrize(

@@ -14,9 +14,9 @@ from orchestrator.domain.retention import (
     BATCH_DAYS,
     Decision,
     JobFacts,
-    Reference,
     References,
-    Rules,
+    RetentionReference,
+    RetentionRules,
     RunFacts,
     age_of,
     decide,
@@ -42,8 +42,8 @@ def test_an_old_run_that_holds_nothing_but_logs_goes_with_its_job() -> None:
         ({"writer": "job 1 of another controller"}, [], NOTHING, "another controller writes it"),
         ({"damage": "run.json: not JSON"}, [], NOTHING, "can't be read"),
         ({}, [JobFacts("new", is_open=True)], NOTHING, "job new has not ended"),
-        ({}, [], References.of([Reference("run", "r", "model a@1 is of it")]), "model a@1 is of it"),
-        ({}, [], References.of([Reference("job", "old", "job w waits for it")]), "job w waits for it"),
+        ({}, [], References.of([RetentionReference("run", "r", "model a@1 is of it")]), "model a@1 is of it"),
+        ({}, [], References.of([RetentionReference("job", "old", "job w waits for it")]), "job w waits for it"),
         ({"results": ("checkpoints",)}, [], References.of([], ["model b@2 can't be read"]), "model b@2 can't be read"),
     ],
 )
@@ -74,7 +74,9 @@ def test_old_jobs_go_without_their_run_where_that_holds_more(
 
 
 def test_who_may_not_see_everything_is_not_told_what_needs_a_run() -> None:
-    references = References.of([Reference("run", "r", "run secret is a clone of it")], ["model hidden can't be read"])
+    references = References.of(
+        [RetentionReference("run", "r", "run secret is a clone of it")], ["model hidden can't be read"]
+    )
     for run in (RUN, RunFacts("r2", results=("checkpoints",))):
         [reason] = still_needed(run, [OLD], references.unnamed())
         assert "something" in reason and "secret" not in reason and "hidden" not in reason
@@ -89,11 +91,11 @@ def test_after_an_upgrade_nothing_goes_in_the_first_days_and_without_a_rule_noth
     None
 ):
     upgraded = NOW - 5 * A_DAY
-    rules = Rules(since=upgraded)
+    rules = RetentionRules(since=upgraded)
     assert rules.batch_limit(NOW) is None
-    assert rules.is_trial(NOW) and not rules.is_trial(upgraded + 7 * A_DAY) and not Rules().is_trial(NOW)
+    assert rules.is_trial(NOW) and not rules.is_trial(upgraded + 7 * A_DAY) and not RetentionRules().is_trial(NOW)
     assert rules.batch_limit(upgraded + BATCH_DAYS * A_DAY) == upgraded
-    assert Rules(batch=False).batch_limit(NOW) is None
+    assert RetentionRules(batch=False).batch_limit(NOW) is None
 
 
 @pytest.mark.parametrize(
@@ -143,8 +145,8 @@ class World:
     def references(self) -> References:
         return References.of(
             [
-                *(Reference("run", run, "x") for run in self.needed_runs),
-                *(Reference("job", job, "x") for job in self.needed_jobs),
+                *(RetentionReference("run", run, "x") for run in self.needed_runs),
+                *(RetentionReference("job", job, "x") for job in self.needed_jobs),
             ]
         )
 

@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
-from orchestrator.control.endings import node_end, seen_end
+from orchestrator.control.node_ends import node_end, seen_end
 from orchestrator.engines.api import Cause, NodePhase, NodeStatus
 from orchestrator.engines.ray.engine import _status as ray_status
-from orchestrator.engines.slurm.commands import SlurmJob
 from orchestrator.engines.slurm.engine import _node as slurm_node
 from orchestrator.engines.slurm.engine import _queued as slurm_queued
+from orchestrator.engines.slurm.slurm_commands import SlurmJob
 from orchestrator.engines.toolkit.endings import ended
 from shared_store.contract.faults import Fault
-from shared_store.volume.outcomes import OUT_OF_MEMORY, FirstError, Outcome
+from shared_store.volume.node_outcomes import OUT_OF_MEMORY, FirstError, Outcome
 
 ENDED, QUEUED, RUNNING, STARTING = NodePhase.ENDED, NodePhase.QUEUED, NodePhase.RUNNING, NodePhase.STARTING
 MEETING = "muster: meeting " + json.dumps({"addresses": ["10.0.0.1", "10.0.0.2"]}) + "\n"

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import yaml
 
-from orchestrator.engines.ray.bundles import in_words
 from orchestrator.engines.ray.cluster import grows_to
+from orchestrator.engines.ray.placement_groups import in_words
 from tests.conftest import REPOSITORY
 
 

@@ -13,10 +13,10 @@ from orchestrator.cli.serving import _squeue_interval
 from orchestrator.domain.errors import SpecError
 from orchestrator.engines.api import Cause, Handle, NodePhase, NodeStatus
 from orchestrator.engines.installed import check_tags
-from orchestrator.engines.slurm import commands
 from orchestrator.engines.slurm import engine as slurm
+from orchestrator.engines.slurm import slurm_commands
 from shared_store.volume.layout import Store
-from shared_store.volume.outcomes import Outcome, write_outcome
+from shared_store.volume.node_outcomes import Outcome, write_outcome
 
 MEETING = 'muster: meeting {"nodes": ["n1"], "addresses": ["10.0.0.1"], "port": 1}\n'
 
@@ -46,7 +46,7 @@ class Cluster:
 
     def call(self, *command: str, **_: Any) -> str:
         if self.away:
-            raise commands.Unreachable("slurmctld does not answer")
+            raise slurm_commands.SlurmUnreachable("slurmctld does not answer")
         if command[0] == "scancel" and len(command) == 2:
             self.states[command[1]] = "CANCELLED"
         if command[0] != "squeue":
@@ -75,7 +75,7 @@ class Cluster:
 @pytest.fixture
 def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster]:
     made = Cluster(tmp_path)
-    monkeypatch.setattr(commands, "call", made.call)
+    monkeypatch.setattr(slurm_commands, "call", made.call)
     monkeypatch.setattr(slurm, "call", made.call)
     with machine.replaced_by(made.machine):
         yield made

@@ -19,8 +19,8 @@ from orchestrator import machine
 from orchestrator.engines import runner
 from orchestrator.engines.api import EngineError, Handle, NotYet, Transient
 from orchestrator.engines.runner import Runner
-from orchestrator.engines.slurm import commands
 from orchestrator.engines.slurm import engine as slurm
+from orchestrator.engines.slurm import slurm_commands
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.testing.rigs import make_gang
 from orchestrator.engines.toolkit import log_copy
@@ -196,11 +196,11 @@ def test_a_slurm_that_never_answers_ends_the_stop(monkeypatch: pytest.MonkeyPatc
     from orchestrator.engines.slurm import engine as slurm
 
     def away(*_: str, **__: Any) -> str:
-        raise slurm.Unreachable("slurmctld does not answer (connection refused); see `scontrol ping`")
+        raise slurm.SlurmUnreachable("slurmctld does not answer (connection refused); see `scontrol ping`")
 
-    monkeypatch.setattr("orchestrator.engines.slurm.commands.call", lambda *_, **__: "")
+    monkeypatch.setattr("orchestrator.engines.slurm.slurm_commands.call", lambda *_, **__: "")
     engine = slurm.SlurmEngine()
-    monkeypatch.setattr("orchestrator.engines.slurm.commands.call", away)
+    monkeypatch.setattr("orchestrator.engines.slurm.slurm_commands.call", away)
     monkeypatch.setattr(slurm, "call", away)
     monkeypatch.setattr(slurm, "_KILLING", 0.05)
     with pytest.raises(Transient, match=r"^the slurm engine has not ended gang job/1/1 .*: slurmctld does not answer"):
@@ -321,10 +321,10 @@ def test_a_slurm_that_went_away_can_t_tell_its_hosts_and_its_last_answer_is_not_
 
     def call(*command: str, **_: object) -> str:
         if not answers:
-            raise commands.Unreachable("slurmctld does not answer")
+            raise slurm_commands.SlurmUnreachable("slurmctld does not answer")
         return answers[0] if "nodes" in command else ""
 
-    monkeypatch.setattr(commands, "call", call)
+    monkeypatch.setattr(slurm_commands, "call", call)
     monkeypatch.setattr(slurm, "_HOSTS_AGE", 0.0)
     engine = slurm.SlurmEngine()
     assert [host.name for host in engine.capacity().machines] == ["slurm/n1"]

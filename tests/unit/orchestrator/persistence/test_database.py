@@ -16,9 +16,9 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.resources import Resources
+from orchestrator.persistence.batch_models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.gangs import Gangs
 from orchestrator.persistence.group_commit import GroupCommit
-from orchestrator.persistence.models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.ownership import owner_of, record_owner
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database

@@ -14,10 +14,10 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
-from orchestrator.persistence.job_counts import JobCounts, Place, note_rows
+from orchestrator.persistence.batch_models import Attempt, Job, Node
+from orchestrator.persistence.job_counts import ArrayRole, JobCounts, note_rows
 from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
-from orchestrator.persistence.models import Attempt, Job, Node
-from orchestrator.persistence.references import forget_jobs
+from orchestrator.persistence.retention_rows import forget_jobs
 from orchestrator.persistence.session import Database
 
 QUEUES = [f"queue-{number}" for number in range(60)]
@@ -247,7 +247,7 @@ def change(session: Session, draw: random.Random, turn: int) -> None:
             session.flush()
             rows = session.execute(select(Job.parent, Job.kind, Job.queue, Job.status).where(Job.id == one.id)).all()
             for parent, kind, queue, status in rows:
-                note_rows(session, queue, status, Place.of(parent, kind), -1)
+                note_rows(session, queue, status, ArrayRole.of(parent, kind), -1)
             session.expunge(one)
             session.execute(delete(Job).where(Job.id == one.id))
 

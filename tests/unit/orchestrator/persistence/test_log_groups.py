@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.domain.errors import RequestError
 from orchestrator.persistence import log_groups
-from orchestrator.persistence.models import Node
+from orchestrator.persistence.batch_models import Node
 from orchestrator.persistence.own_models import LogGroup
 from orchestrator.persistence.session import Database
 from tests.support.definitions import container

@@ -10,7 +10,7 @@ from sqlalchemy import event, insert
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.persistence.session import Database
 from tests.support.orchestrator.rows import job

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select, text
 
-from orchestrator.domain.retention import A_DAY, BATCH_DAYS, Rules
-from orchestrator.persistence.models import Job
-from orchestrator.persistence.references import due, jobs_of_runs
+from orchestrator.domain.retention import A_DAY, BATCH_DAYS, RetentionRules
+from orchestrator.persistence.batch_models import Job
+from orchestrator.persistence.retention_rows import due, jobs_of_runs
 from orchestrator.persistence.session import Database
 from tests.support.orchestrator.rows import job
 
@@ -28,21 +28,21 @@ def database(tmp_path: Path) -> Iterator[Database]:
 @pytest.mark.parametrize(
     ("rules", "queue", "from_yaml", "age"),
     [
-        (Rules(QUEUES, ["any"], default=A_DAY), "short", True, A_DAY // 2),
-        (Rules(QUEUES, ["any"], default=A_DAY), "kept", False, None),
-        (Rules(QUEUES, ["any"], default=A_DAY), "any", True, A_DAY),
-        (Rules(QUEUES, ["any"], default=A_DAY), "any", False, A_DAY),
-        (Rules(QUEUES, ["any"], default=A_DAY), "deleted", False, None),
-        (Rules(others=["any"]), "any", True, None),
-        (Rules(others=["any"]), "any", False, BATCH_DAYS * A_DAY),
-        (Rules(others=["any"]), "deleted", False, None),
-        (Rules(others=["any"], batch=False), "any", False, None),
-        (Rules(others=["any"], since=NOW - 5 * A_DAY), "any", False, None),
-        (Rules(QUEUES, since=NOW - 5 * A_DAY), "short", False, A_DAY // 2),
+        (RetentionRules(QUEUES, ["any"], default=A_DAY), "short", True, A_DAY // 2),
+        (RetentionRules(QUEUES, ["any"], default=A_DAY), "kept", False, None),
+        (RetentionRules(QUEUES, ["any"], default=A_DAY), "any", True, A_DAY),
+        (RetentionRules(QUEUES, ["any"], default=A_DAY), "any", False, A_DAY),
+        (RetentionRules(QUEUES, ["any"], default=A_DAY), "deleted", False, None),
+        (RetentionRules(others=["any"]), "any", True, None),
+        (RetentionRules(others=["any"]), "any", False, BATCH_DAYS * A_DAY),
+        (RetentionRules(others=["any"]), "deleted", False, None),
+        (RetentionRules(others=["any"], batch=False), "any", False, None),
+        (RetentionRules(others=["any"], since=NOW - 5 * A_DAY), "any", False, None),
+        (RetentionRules(QUEUES, since=NOW - 5 * A_DAY), "short", False, A_DAY // 2),
     ],
 )
 def test_a_rule_of_a_queue_goes_before_that_of_the_controller_which_goes_before_the_batch_api_s(
-    database: Database, rules: Rules, queue: str, from_yaml: bool, age: int | None
+    database: Database, rules: RetentionRules, queue: str, from_yaml: bool, age: int | None
 ) -> None:
     """``age``: from which a job is due; None: it never is."""
     ends = {"at once": 1, "open": None, "young": NOW - (age or 0) + 1, "old": NOW - (age or 0)}
@@ -58,7 +58,7 @@ def test_a_rule_of_a_queue_goes_before_that_of_the_controller_which_goes_before_
 
 
 def test_the_oldest_due_jobs_are_found_by_time_and_not_by_sorting_all_jobs_of_their_queues(database: Database) -> None:
-    query = select(Job.id).where(due(Rules(others=["any", "other"]), NOW)).order_by(Job.stopped_at).limit(100)
+    query = select(Job.id).where(due(RetentionRules(others=["any", "other"]), NOW)).order_by(Job.stopped_at).limit(100)
     written = query.compile(database.engine, compile_kwargs={"literal_binds": True})
     with database.session() as session:
         plan = " ".join(row.detail for row in session.execute(text(f"EXPLAIN QUERY PLAN {written}")))

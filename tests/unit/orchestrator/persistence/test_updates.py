@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import event, select
 
 from orchestrator.domain.job import Status
-from orchestrator.persistence.models import Attempt, Job, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
 from tests.support.orchestrator.rows import job
 

@@ -6,7 +6,7 @@ import pytest
 
 from orchestrator.domain.gang import Shape
 from orchestrator.scheduling.decisions import Cancel, Preempt
-from orchestrator.scheduling.snapshot import Queue, Running, TimeLimit
+from orchestrator.scheduling.snapshot import Queue, RunningGang, TimeLimit
 from tests.support.orchestrator.scheduling import (
     CAPACITY,
     FAIR,
@@ -31,7 +31,7 @@ from tests.support.orchestrator.scheduling import (
 HIGH = [queue("high", 9), queue("mid", 5), queue("low", 1)]
 
 
-def cart(cpus: float = 4, queue: str = "low", name: str = "cart", host: str = "a", **facts: object) -> Running:
+def cart(cpus: float = 4, queue: str = "low", name: str = "cart", host: str = "a", **facts: object) -> RunningGang:
     """A gang that may be preempted."""
     return running(name, on(host, cpus), queue=queue, **{"preemptible": True, **facts})
 
@@ -58,7 +58,7 @@ def test_a_job_of_a_higher_queue_preempts_also_for_the_cpus_that_may_be_used_and
         ([cart(queue="high")], [queue("high")]),  # first in, first out
     ],
 )
-def test_only_what_may_be_preempted_and_gives_room_is(held: list[Running], queues: list[Queue]) -> None:
+def test_only_what_may_be_preempted_and_gives_room_is(held: list[RunningGang], queues: list[Queue]) -> None:
     assert Pass([host()], [job("ant", 3, queue="high", priority=9)], held, queues).preempts == ()
 
 

@@ -20,10 +20,10 @@ from orchestrator.scheduling.snapshot import (
     ComputeEnvironment,
     FairShare,
     Queue,
-    Running,
+    RoundRobin,
+    RunningGang,
     Snapshot,
     TimeLimit,
-    Turns,
     Waiting,
 )
 from tests.support.orchestrator.scheduling import NOW, environment, gang, host, node, queue, seats
@@ -41,14 +41,16 @@ def shapes(draw: st.DrawFn) -> Shape:
     return gang(*members, minimum=draw(st.integers(1, len(members))))
 
 
-def begun(job: Waiting, compute_environment: str, placements: object, now: int, preemptible: bool = False) -> Running:
-    return Running(
+def begun(
+    job: Waiting, compute_environment: str, placements: object, now: int, preemptible: bool = False
+) -> RunningGang:
+    return RunningGang(
         job.job, job.name, job.queue, job.share, job.priority, compute_environment, placements, now, job.timeout, preemptible, False
     )  # fmt: skip
 
 
 def check_capacity(
-    hosts: Iterable[Host], compute_environments: Mapping[str, ComputeEnvironment], running: Iterable[Running]
+    hosts: Iterable[Host], compute_environments: Mapping[str, ComputeEnvironment], running: Iterable[RunningGang]
 ) -> None:
     """Nothing is given out twice, and every gang is where its compute environment allows."""
     running = list(running)
@@ -107,10 +109,10 @@ def equal_decisions(one: Decisions, two: Decisions, queues: Iterable[str]) -> bo
 # -- the head's reservation -------------------------------------------------------------------------------------------
 
 
-def earliest(shape: Shape, hosts: Sequence[Host], running: Sequence[Running], now: int) -> float:
+def earliest(shape: Shape, hosts: Sequence[Host], running: Sequence[RunningGang], now: int) -> float:
     """When the shape fits if gangs end at their timeouts and nothing else starts [ms]."""
 
-    def end(gang: Running) -> float:
+    def end(gang: RunningGang) -> float:
         assert gang.started_at is not None
         return inf if gang.timeout is None else gang.started_at + 1000 * gang.timeout
 
@@ -137,7 +139,9 @@ def jobs(prefix: str, timeouts: st.SearchStrategy[int | None], size: int) -> st.
     )
 
 
-def snapshot_of(hosts: Sequence[Host], waiting: Sequence[Waiting], running: Sequence[Running], now: int) -> Snapshot:
+def snapshot_of(
+    hosts: Sequence[Host], waiting: Sequence[Waiting], running: Sequence[RunningGang], now: int
+) -> Snapshot:
     return Snapshot(now, hosts, {"all": environment()}, {"default": queue()}, waiting, running, {})
 
 
@@ -184,7 +188,7 @@ def test_every_job_starts_no_later_than_was_promised_when_it_first_was_the_head(
     hosts: list[Host], waiting: list[Waiting], fractions: list[float]
 ) -> None:
     """All ends are known, but gangs may end sooner; every gang that can ever start does."""
-    now, running = NOW, list[Running]()
+    now, running = NOW, list[RunningGang]()
     ends: dict[str, int] = {}
     promised: dict[str, float] = {}
     left = {job.job: job for job in waiting}
@@ -233,11 +237,11 @@ class Cluster(RuleBasedStateMachine):
         self.now = NOW
         self.hosts, self.compute_environments = dict(HOSTS), dict(COMPUTE_ENVIRONMENTS)
         self.waiting: dict[str, Waiting] = {}
-        self.running: dict[str, Running] = {}
+        self.running: dict[str, RunningGang] = {}
         self.jobs: dict[str, tuple[Waiting, bool]] = {}
         """Every job ever, and whether it may be preempted."""
         self.usage: dict[tuple[str, str], float] = {}
-        self.turns = Turns()
+        self.turns = RoundRobin()
         self.decisions: Decisions | None = None
 
     @rule(

@@ -7,7 +7,7 @@ import pytest
 from orchestrator.domain.gang import Shape
 from orchestrator.scheduling import free_resources as free
 from orchestrator.scheduling.placement import place
-from orchestrator.scheduling.snapshot import FairShare, Running
+from orchestrator.scheduling.snapshot import FairShare, RunningGang
 from tests.support.orchestrator.scheduling import (
     CAPACITY,
     Pass,
@@ -29,7 +29,7 @@ BEHIND = f"2nd in queue default, behind job large (large-01), which {needs(4)}"
 LARGE = job("large", 4)
 
 
-def cart(cpus: float = 1, **facts: object) -> Running:
+def cart(cpus: float = 1, **facts: object) -> RunningGang:
     return running("cart", on("a", cpus), **facts)
 
 

@@ -8,13 +8,13 @@ from math import inf
 from orchestrator.domain.hosts import Host
 from orchestrator.scheduling.free_resources import FreeResources
 from orchestrator.scheduling.reservation import Reservation, holder_of, reserve
-from orchestrator.scheduling.snapshot import ComputeEnvironment, Running, Snapshot, Waiting
+from orchestrator.scheduling.snapshot import ComputeEnvironment, RunningGang, Snapshot, Waiting
 from tests.support.orchestrator.scheduling import NOW, environment, gang, host, job, node, on, running
 
 
 def reserved(
     asked: Waiting,
-    held: Sequence[Running],
+    held: Sequence[RunningGang],
     hosts: Sequence[Host] = (host("a", 4), host("b", 4)),
     environments: Sequence[ComputeEnvironment] = (environment(),),
 ) -> Reservation | None:
@@ -30,7 +30,7 @@ def told(found: Reservation | None) -> tuple[float, str, str]:
     return (found.window.at - NOW) / 1000, hosts, " ".join(each.name for each in found.awaits)
 
 
-def ends(name: str, seconds: int | None, *places: tuple[str, float], **facts: object) -> Running:
+def ends(name: str, seconds: int | None, *places: tuple[str, float], **facts: object) -> RunningGang:
     """A gang that ends in so many seconds."""
     held = [on(place, cpus) for place, cpus in places]
     return running(name, *held, for_seconds=0, timeout=seconds, **facts)  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from orchestrator.scheduling.decisions import decide
-from orchestrator.scheduling.snapshot import FairShare, Queue, Running, Snapshot, Turns, Waiting
+from orchestrator.scheduling.snapshot import FairShare, Queue, RoundRobin, RunningGang, Snapshot, Waiting
 from tests.support.orchestrator.scheduling import FAIR, NOW, Pass, environment, gang, host, job, line, node, queue
 
 DEFAULT = queue()
@@ -22,8 +22,8 @@ class Cluster:
     queues: dict[str, Queue] = field(default_factory=lambda: {"default": DEFAULT})
     now: int = NOW
     waiting: list[Waiting] = field(default_factory=list)
-    running: dict[str, tuple[Running, int]] = field(default_factory=dict)
-    turns: Turns = field(default_factory=Turns)
+    running: dict[str, tuple[RunningGang, int]] = field(default_factory=dict)
+    turns: RoundRobin = field(default_factory=RoundRobin)
     started: list[str] = field(default_factory=list)
 
     def submit(self, *names: str, owner: str | None = None, cpus: float = 1, queue: str = "default") -> None:
@@ -45,7 +45,7 @@ class Cluster:
             by_id = {each.job: each for each in self.waiting}
             for start in decided.starts:
                 each = by_id[start.job]
-                gang = Running(
+                gang = RunningGang(
                     each.job, each.name, each.queue, None, 0, "all", start.placements, self.now, None, False, False
                 )
                 self.running[each.job] = gang, length

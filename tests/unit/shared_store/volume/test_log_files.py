@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.api.logs import events
-from orchestrator.api.logs.events import LogFile
+from orchestrator.api.logs import log_events
+from orchestrator.api.logs.log_events import LogFile
 from shared_store.contract.node import LEAST_LOG_LIMIT
 from shared_store.volume.layout import Run
 from shared_store.volume.log_files import LogWriter, left_out, log_segments, read_log, segments_of
@@ -262,7 +262,7 @@ def test_files_of_other_names_are_no_part_of_a_log(tmp_path: Path) -> None:
 def test_one_look_passes_over_a_bounded_part_of_a_hole_and_the_next_one_goes_on(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(events, "_BARREN", 4 << 20)
+    monkeypatch.setattr(log_events, "_BARREN", 4 << 20)
     path = run.log("job", 1, 0)
     path.parent.mkdir(parents=True)
     first, last = lines_of(0, 1), lines_of(1, 1)

@@ -10,32 +10,32 @@ from typing import Any
 import pytest
 
 from shared_store.contract.faults import Fault
-from shared_store.volume import outcomes
+from shared_store.volume import node_outcomes
 from shared_store.volume.layout import Run
 
-ERROR = outcomes.FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
-OUTCOME = outcomes.Outcome(0, 1, 3, "SIGKILL", "reason", ERROR, 1e9, 1e9)
+ERROR = node_outcomes.FirstError(rank=0, message="broke", traceback="Traceback …", time=1e9)
+OUTCOME = node_outcomes.Outcome(0, 1, 3, "SIGKILL", "reason", ERROR, 1e9, 1e9)
 
 
 def test_long_texts_are_cut_where_they_are_written_and_say_how_much_is_missing(tmp_path: Path) -> None:
     run, long = Run(tmp_path), "begin " + "x" * 10_000_000 + " end"
     error = replace(ERROR, message=long, traceback=long)
-    outcomes.write_outcome(run, "job", 1, replace(OUTCOME, reason=long, error=error))
-    assert run.outcome("job", 1, 0).stat().st_size < 4 * outcomes.LONGEST_TEXT
-    outcome = outcomes.read_outcome(run, "job", 1, 0)
-    assert outcome and outcome.error and outcome == outcomes.bounded(outcome)
+    node_outcomes.write_outcome(run, "job", 1, replace(OUTCOME, reason=long, error=error))
+    assert run.outcome("job", 1, 0).stat().st_size < 4 * node_outcomes.LONGEST_TEXT
+    outcome = node_outcomes.read_outcome(run, "job", 1, 0)
+    assert outcome and outcome.error and outcome == node_outcomes.bounded(outcome)
     assert outcome.reason == outcome.error.message
     assert outcome.reason.startswith("begin x") and outcome.reason.endswith("x … (9983690 characters left out)")
     traceback = outcome.error.traceback
     assert traceback.startswith("(9983690 characters left out) …") and traceback.endswith(" end")
-    assert max(len(outcome.reason), len(traceback)) <= outcomes.LONGEST_TEXT
+    assert max(len(outcome.reason), len(traceback)) <= node_outcomes.LONGEST_TEXT
 
 
 @pytest.mark.parametrize("fault", [None, Fault("ValueError", "reward.py", 3)])
 def test_an_outcome_comes_back_with_its_fault(tmp_path: Path, fault: Fault | None) -> None:
     error = replace(ERROR, fault=fault)
-    outcomes.write_outcome(Run(tmp_path), "job", 1, replace(OUTCOME, error=error))
-    assert outcomes.read_outcome(Run(tmp_path), "job", 1, 0) == replace(OUTCOME, error=error)
+    node_outcomes.write_outcome(Run(tmp_path), "job", 1, replace(OUTCOME, error=error))
+    assert node_outcomes.read_outcome(Run(tmp_path), "job", 1, 0) == replace(OUTCOME, error=error)
 
 
 WRONG: list[dict[str, Any]] = [
@@ -53,7 +53,7 @@ def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict
     path = Run(tmp_path).outcome("job", 1, 0)
     path.parent.mkdir(parents=True)
     path.write_text(json.dumps({**asdict(OUTCOME), **change}))
-    assert outcomes.read_outcome(Run(tmp_path), "job", 1, 0) is None
+    assert node_outcomes.read_outcome(Run(tmp_path), "job", 1, 0) is None
 
 
 @pytest.mark.parametrize(
@@ -70,12 +70,12 @@ def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict
     ],
 )
 def test_the_first_that_was_not_asked_to_end_is_the_cause(ends: list[tuple[bool, float]], cause: int) -> None:
-    assert outcomes.first_cause(ends) == cause
+    assert node_outcomes.first_cause(ends) == cause
 
 
 def test_an_outcome_is_read_as_it_was_written_and_one_of_an_older_version_was_not_asked() -> None:
     asked = replace(OUTCOME, asked=True)
     written = asdict(asked)
-    assert outcomes.parse_outcome(written) == asked
+    assert node_outcomes.parse_outcome(written) == asked
     del written["asked"]
-    assert outcomes.parse_outcome(written) == OUTCOME
+    assert node_outcomes.parse_outcome(written) == OUTCOME

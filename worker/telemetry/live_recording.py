@@ -1,4 +1,4 @@
-"""``python -m worker.telemetry.live``: record a training as it runs on this machine, or recover a recording that was cut short.
+"""``python -m worker.telemetry.live_recording``: record a training as it runs on this machine, or recover a recording that was cut short.
 
 ``muster record`` starts it.
 """
@@ -146,7 +146,7 @@ def stage_of(run: Run, worlds: int) -> tuple[Stage, dict[str, Any]]:
 
 def main() -> int:
     """Read the arguments; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m worker.telemetry.live")
+    parser = argparse.ArgumentParser(prog="python -m worker.telemetry.live_recording")
     parser.add_argument("run", nargs="?", type=Path)
     parser.add_argument("--recover", type=Path)
     parser.add_argument("--job", default="")

@@ -1,4 +1,4 @@
-"""Placement bundles for Ray: one for each node of a gang, each on a machine of its own."""
+"""Placement groups of Ray: a gang's has a bundle for each node, each on a machine of its own."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ _AWAY_STATES = frozenset(
 """Words of a node's state that mean that nothing can start there now. ``POWERED_DOWN`` is none: Slurm boots such a node for a job."""
 
 
-class Unreachable(NotYet):
+class SlurmUnreachable(NotYet):
     """slurmctld does not answer now; it may later."""
 
 
@@ -50,7 +50,7 @@ def call(*command: str, text: str | None = None) -> str:
         EngineError: It refused, in its own words.
     """
     if (told := os.environ.get("SLURM_CONF")) and not os.path.exists(told):  # Slurm itself would try for a minute
-        raise Unreachable(f"SLURM_CONF is {told}, which is not there; set it to the cluster's slurm.conf")
+        raise SlurmUnreachable(f"SLURM_CONF is {told}, which is not there; set it to the cluster's slurm.conf")
     try:
         done = subprocess.run(
             command, input=text, capture_output=True, text=True, timeout=_LIMIT, env=environment(), errors="replace"
@@ -61,9 +61,9 @@ def call(*command: str, text: str | None = None) -> str:
             "start the controller on a login node, or install Slurm's client commands (Debian: slurm-client)"
         ) from None
     except OSError as error:  # no process or descriptor to be had
-        raise Unreachable(f"can't run {command[0]} now: {error}") from None
+        raise SlurmUnreachable(f"can't run {command[0]} now: {error}") from None
     except subprocess.TimeoutExpired:
-        raise Unreachable(
+        raise SlurmUnreachable(
             f"slurmctld does not answer ({command[0]} waited {_LIMIT:g} s); see `scontrol ping`"
         ) from None
     if done.returncode == 0:
@@ -71,7 +71,7 @@ def call(*command: str, text: str | None = None) -> str:
     said = [re.sub(r"^\w+: (error|fatal): ", "", line).strip() for line in done.stderr.splitlines() if line.strip()]
     why = "; ".join(dict.fromkeys(said)) or f"exit code {done.returncode}"
     if _AWAY.search(why):
-        raise Unreachable(f"slurmctld does not answer ({why}); see `scontrol ping`")
+        raise SlurmUnreachable(f"slurmctld does not answer ({why}); see `scontrol ping`")
     if _UNCONFIGURED.search(why):
         raise EngineError(
             "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/slurm.conf, or set "

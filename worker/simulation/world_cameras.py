@@ -1,4 +1,4 @@
-"""One camera per world, which renders straight into the buffer that the policy reads."""
+"""The cameras of the worlds, one in each: they render straight into the buffer that the policy reads."""
 
 from __future__ import annotations
 
@@ -168,7 +168,7 @@ def draw_light(ends: Sequence[float], episodes: EpisodeArrays, light: wp.array[w
     wp.launch(_draw_light, dim=light.shape, inputs=[wp.vec2(*ends), episodes, light], device=light.device)
 
 
-class Camera:
+class WorldCameras:
     """Renders all worlds into :attr:`images`; launches only, so that it can be captured.
 
     Args:

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any
 
 from shared_store.process.tether import start_tied
-from shared_store.volume.outcomes import EX_TEMPFAIL
+from shared_store.volume.node_outcomes import EX_TEMPFAIL
 from worker.learning.job import Job
 from worker.settings.errors import UserError
 

@@ -1,4 +1,4 @@
-"""The ``track`` section of the job YAML: the services to which a training's metrics are sent as well."""
+"""The tracking services of a job, its YAML's section ``track``: those to which a training's metrics are sent as well."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class MLflow(Section):
     tags: dict[str, str] = Field(default_factory=dict)
 
 
-class Track(Section):
+class TrackingServices(Section):
     """Services that get the metrics of a training: ``wandb``, ``[wandb, mlflow]``, or each with its settings."""
 
     wandb: WandB | None = None

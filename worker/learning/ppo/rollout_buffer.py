@@ -1,4 +1,4 @@
-"""A rollout: the data of one iteration of all worlds, in buffers with fixed addresses."""
+"""The rollout buffer: the data of one iteration of all worlds, in buffers with fixed addresses."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from torch import nn
 
 from worker.learning.algorithm import Transition
 from worker.learning.ppo import linear_layers as linear
-from worker.learning.ppo.models import PixelModel
+from worker.learning.ppo.networks import PixelModel
 
 
-class View:
+class GroupRollout:
     """One observation group over a rollout, as one network sees it.
 
     Attributes:
@@ -53,7 +53,7 @@ class View:
         return self.padded.flatten(0, 1)[rows]
 
 
-class Rollout:
+class RolloutBuffer:
     """The record of an iteration; each part has shape (steps, worlds) and its own last dimension.
 
     Attributes:
@@ -65,7 +65,7 @@ class Rollout:
         terminal: Observations of the critic's group before the reset, valid where an episode ended; None for images.
     """
 
-    def __init__(self, actor: View, critic: View, outputs: int, actions: int) -> None:
+    def __init__(self, actor: GroupRollout, critic: GroupRollout, outputs: int, actions: int) -> None:
         self.actor, self.critic = actor, critic
         self.views = [actor] if critic is actor else [actor, critic]
         steps, worlds = actor.latents.shape[:2]

@@ -1,4 +1,4 @@
-"""What the store has of runs, and what in it needs them, as retention asks (:mod:`.retention`)."""
+"""The facts about runs in the store, and what in it needs them, as retention asks (:mod:`.retention`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 from orchestrator import machine
 from orchestrator.control.peers import Peers
-from orchestrator.domain.retention import Reference, References, RunFacts
+from orchestrator.domain.retention import References, RetentionReference, RunFacts
 from shared_store.volume import contents
 from shared_store.volume.files import is_there
 from shared_store.volume.layout import Run, Store
@@ -70,7 +70,9 @@ class StoredRuns:
                 self.check()
                 needed, unreadable = references(self._store)
                 self.check()
-                found = _Found(References.of((Reference(*each) for each in needed), unreadable), began, version)
+                found = _Found(
+                    References.of((RetentionReference(*each) for each in needed), unreadable), began, version
+                )
                 self._found = found
             return found.references
 

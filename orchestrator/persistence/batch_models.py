@@ -1,4 +1,4 @@
-"""The models of the database's tables: definitions, queues, compute environments, policies, jobs, attempts, runs.
+"""The models of what AWS Batch has, too, as tables: definitions, queues, compute environments, policies, jobs, attempts, runs.
 
 Times are Unix milliseconds, as in the Batch API. A change here needs a migration (``orchestrator/persistence/migrations``); a test compares.
 """

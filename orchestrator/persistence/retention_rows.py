@@ -1,4 +1,4 @@
-"""References in the database to runs and jobs, and the facts about jobs on which retention decides."""
+"""The rows by which retention decides: references to runs and jobs, and the facts about jobs."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from sqlalchemy import ColumnElement, and_, case, delete, false, not_, or_, sele
 from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import A_DAY, JobFacts, Reference, Rules
-from orchestrator.persistence.job_counts import Place, note_rows
-from orchestrator.persistence.models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
+from orchestrator.domain.retention import A_DAY, JobFacts, RetentionReference, RetentionRules
+from orchestrator.persistence.batch_models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
+from orchestrator.persistence.job_counts import ArrayRole, note_rows
 from orchestrator.persistence.own_models import AutomaticEvaluation, RunUse, ShareUsage, WebhookDelivery
 
 _SUBMITTED = {"MUSTER_DIRECTORY", "MUSTER_SPEC"}
@@ -21,7 +21,9 @@ _UNUSED = 90 * A_DAY
 """Milliseconds after which the use of a share is forgotten."""
 
 
-def jobs_of_runs(session: Session, runs: Collection[str], rules: Rules, moment: int) -> dict[str, list[JobFacts]]:
+def jobs_of_runs(
+    session: Session, runs: Collection[str], rules: RetentionRules, moment: int
+) -> dict[str, list[JobFacts]]:
     """All jobs of these runs, by run, as they are at a moment (Unix time [ms]). The jobs of an array are due together."""
     found: dict[str, list[JobFacts]] = {run: [] for run in runs}
     other = aliased(Job)
@@ -38,26 +40,26 @@ def jobs_of_runs(session: Session, runs: Collection[str], rules: Rules, moment: 
     return found
 
 
-def references(session: Session, runs: Collection[str]) -> Iterator[Reference]:
+def references(session: Session, runs: Collection[str]) -> Iterator[RetentionReference]:
     """What needs these runs, or jobs of them."""
     is_open = Job.status.not_in(TERMINAL)
     uses = select(RunUse.run, Job.id).join(Job, Job.id == RunUse.job_id)
     for used, job in session.execute(uses.where(RunUse.run.in_(runs), is_open)):
-        yield Reference("run", used, f"job {job} needs it")
+        yield RetentionReference("run", used, f"job {job} needs it")
     evaluated = select(AutomaticEvaluation.run, AutomaticEvaluation.job).where(AutomaticEvaluation.open)
     for evaluation in session.execute(evaluated.where(AutomaticEvaluation.run.in_(runs))):
-        yield Reference("run", evaluation.run, f"job {evaluation.job} evaluates it")
+        yield RetentionReference("run", evaluation.run, f"job {evaluation.job} evaluates it")
     ids = select(Job.id).where(Job.run.in_(runs))
     waits = select(Dependency.on_id, Dependency.job_id).join(Job, Job.id == Dependency.job_id)
     for job, waiting in session.execute(waits.where(Dependency.on_id.in_(ids), is_open)):
-        yield Reference("job", job, f"job {waiting} waits for it")
+        yield RetentionReference("job", job, f"job {waiting} waits for it")
     array = aliased(Job)
     of_array = select(Job.id, array.id).join(array, array.id == Job.parent).where(Job.run.in_(runs))
     for job, parent in session.execute(of_array.where(array.status.not_in(TERMINAL))):
-        yield Reference("job", job, f"it belongs to array {parent}, which has not ended")
+        yield RetentionReference("job", job, f"it belongs to array {parent}, which has not ended")
 
 
-def due(rules: Rules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:
+def due(rules: RetentionRules, moment: int, job: type[Job] = Job) -> ColumnElement[bool]:
     """Which jobs may go at a moment (Unix time [ms]), as far as rules and times tell."""
     queue_of = job.queue.concat("")  # so that SQLite uses the index by time, which has the queue, and no index by queue
     each = [
@@ -87,7 +89,7 @@ def forget_jobs(session: Session, ids: Collection[str]) -> set[str]:
     found = session.execute(query.where(Job.status.in_(TERMINAL), Job.id.not_in(needed), not_(has_others))).all()
     gone = [row.id for row in found]
     for row in found:
-        note_rows(session, row.queue, row.status, Place.of(row.parent, row.kind), -1)
+        note_rows(session, row.queue, row.status, ArrayRole.of(row.parent, row.kind), -1)
     session.execute(delete(WebhookDelivery).where(WebhookDelivery.job.in_(gone), WebhookDelivery.next_at.is_(None)))
     session.execute(
         delete(AutomaticEvaluation).where(AutomaticEvaluation.training.in_(gone), AutomaticEvaluation.open.is_(False))

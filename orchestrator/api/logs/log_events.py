@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shared_store.volume.files import DamagedFile, open_regular
-from shared_store.volume.log_files import UNKNOWN, Segment, left_out, read_log, segments_of
+from shared_store.volume.log_files import UNKNOWN, LogSegment, left_out, read_log, segments_of
 from shared_store.volume.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, LogLine, lines_in
 
 _BLOCK = 32 << 10
@@ -39,7 +39,7 @@ _STAMPS = re.compile(rb"^(" + STAMP + rb") (?!- o " + _END.encode() + rb")(?:-|\
 """Times of the lines that are events."""
 
 
-class Event(NamedTuple):
+class LogEvent(NamedTuple):
     """One line. Events compare by time, then stream, then position: the order in which a merge of streams gives them."""
 
     time: int
@@ -75,7 +75,7 @@ class LogFile:
         self._begun, self._barren = 0, 0
         self._forget()
 
-    def look(self) -> View:
+    def look(self) -> LogSnapshot:
         """A view of the log as it is now: whole lines only. A log that does not exist yet is empty. Raises OSError.
 
         A look skips at most 64 MiB that hold no events; the next look continues there.
@@ -92,7 +92,9 @@ class LogFile:
                 except FileNotFoundError:  # deleted since it was listed
                     segments = segments_of(self.path)
             self._drop_deleted(segments)
-            return View(self, segments, self._marks, len(self._marks), self._end, self._top, self._gap, self._begun)
+            return LogSnapshot(
+                self, segments, self._marks, len(self._marks), self._end, self._top, self._gap, self._begun
+            )
 
     def _forget(self) -> None:
         self._marks: list[tuple[int, int]] = [(0, 0)]
@@ -105,7 +107,7 @@ class LogFile:
         self._identity, self._inside = UNKNOWN, False
         self._begun += 1
 
-    def _extend(self, segments: Sequence[Segment]) -> bool:
+    def _extend(self, segments: Sequence[LogSegment]) -> bool:
         """Take up the next blocks; False where no whole line is left."""
         chunk = read_log(segments, self._end, _READ, self._identity, self._inside)
         if chunk.replaced:
@@ -133,7 +135,7 @@ class LogFile:
         if self._marks[-1][0] != offset:
             self._marks.append((offset, self._top))
 
-    def _drop_deleted(self, segments: Sequence[Segment]) -> None:
+    def _drop_deleted(self, segments: Sequence[LogSegment]) -> None:
         """Put the gap in the place of segments that are gone; a view keeps the marks that it has."""
         if self._tail is None or len(segments) < 2 or segments[1].start > self._end:
             return
@@ -153,11 +155,11 @@ class Gap(NamedTuple):
 
 
 @dataclass(frozen=True)
-class View:
+class LogSnapshot:
     """A log as it was at one look."""
 
     file: LogFile
-    segments: Sequence[Segment]
+    segments: Sequence[LogSegment]
     marks: list[tuple[int, int]]
     """Shared with the file, which only adds to it; the first ``count`` are this view's."""
     count: int
@@ -169,11 +171,11 @@ class View:
     begun: int
     """Number of times that the log began: it differs from the look before where the log was truncated or replaced."""
 
-    def replaced(self) -> Event:
+    def replaced(self) -> LogEvent:
         """The event that a follower gets when a log was truncated or replaced."""
-        return Event(self.top, self.file.source, 0, 0, self.file.stream, REPLACED)
+        return LogEvent(self.top, self.file.source, 0, 0, self.file.stream, REPLACED)
 
-    def forward(self, since: int = 0, start: int = 0) -> Iterator[Event]:
+    def forward(self, since: int = 0, start: int = 0) -> Iterator[LogEvent]:
         """Events not before the time ``since`` [ms] and the byte ``start``, the oldest first. Raises OSError."""
         if since > self.top or start >= self.end:
             return
@@ -186,7 +188,7 @@ class View:
                 if event.time >= since and start <= event.offset < event.end:
                     yield event
 
-    def backward(self, before: int | None = None, until: int | None = None) -> Iterator[Event]:
+    def backward(self, before: int | None = None, until: int | None = None) -> Iterator[LogEvent]:
         """Events before the time ``before`` [ms] and the byte ``until``, the newest first. Raises OSError."""
         until = self.end if until is None else until
         last = bisect_left(self.marks, until, hi=self.count, key=lambda mark: mark[0]) - 1
@@ -197,17 +199,17 @@ class View:
                 if event.offset < until and (before is None or event.time < before):
                     yield event
 
-    def _events(self, block: int) -> list[Event]:
+    def _events(self, block: int) -> list[LogEvent]:
         offset, time = self.marks[block]
         stop = self.marks[block + 1][0] if block + 1 < self.count else self.end
         if self.gap and offset == self.gap.start:
             text = left_out(self.gap.lines, self.gap.end - self.gap.start, LIMIT_REACHED)
-            return [Event(time, self.file.source, offset, self.gap.end, self.file.stream, text)]
+            return [LogEvent(time, self.file.source, offset, self.gap.end, self.file.stream, text)]
         events = []
         for begin, line in lines_in(self._read(offset, stop - offset), (0, 0), offset):
             if is_event(line):
                 time = max(time, milliseconds(line.time))
-                events.append(Event(time, self.file.source, begin, line.position, self.file.stream, line.text))
+                events.append(LogEvent(time, self.file.source, begin, line.position, self.file.stream, line.text))
         return events
 
     def _read(self, offset: int, size: int) -> bytes:

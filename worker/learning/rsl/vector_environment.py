@@ -1,7 +1,7 @@
-"""Tasks as environments of rsl_rl, for your own runner scripts::
+"""Tasks as vector environments of rsl_rl, for your own runner scripts::
 
     from rsl_rl.runners import OnPolicyRunner
-    from worker.learning.rsl.environment import make
+    from worker.learning.rsl.vector_environment import make
 
     runner = OnPolicyRunner(make("Cartpole", 64, seed=1), config, "logs", "cpu")
     runner.learn(100, init_at_random_ep_len=True)

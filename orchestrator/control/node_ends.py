@@ -1,10 +1,10 @@
-"""The ending of a node: by its outcome in the store, else as its engine saw it."""
+"""The ends of nodes: each by its outcome in the store, else as its engine saw it."""
 
 from __future__ import annotations
 
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
-from shared_store.volume.outcomes import Outcome
+from shared_store.volume.node_outcomes import Outcome
 
 _TAKEN = (Cause.SIGNAL, Cause.HOST_LOST, Cause.PREEMPTED)
 """Causes from outside: who does not see the supervisor any more can't tell its end from that of its host."""

@@ -24,7 +24,7 @@ class Batch:
     """Discount of the future: γ to the number of steps; 0 without a future. Shape (samples,), float32."""
 
 
-class Replay:
+class ReplayBuffer:
     """A ring of (capacity steps, worlds), allocated once.
 
     For each step of each world it holds the observations before it and the action (``before``), the observations after it (``after``:

@@ -50,7 +50,7 @@ class Number:
 
 
 @dataclass(frozen=True)
-class Group:
+class ItemList:
     """A tuple or list of known length, kept item by item."""
 
     items: tuple[Value, ...]
@@ -76,7 +76,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Rows:
+class RuntimeList:
     """A list whose length is known when it runs: waypoints, and the objects.
 
     Attributes:
@@ -90,7 +90,7 @@ class Rows:
     row: Callable[[str], Value]
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Rows) and self.name == other.name
+        return isinstance(other, RuntimeList) and self.name == other.name
 
     def __hash__(self) -> int:
         return hash(self.name)
@@ -113,8 +113,8 @@ class Thing:
     scope: Any = None
 
 
-Value = Number | Group | Constant | Rows | Thing
-Shape = str | tuple["Shape", ...] | Constant | Rows | Thing
+Value = Number | ItemList | Constant | RuntimeList | Thing
+Shape = str | tuple["Shape", ...] | Constant | RuntimeList | Thing
 """The type of a variable: the kind of a number, those of a group's items, or the value itself where nothing has to be held."""
 
 
@@ -156,7 +156,7 @@ def shape_of(value: Value) -> Shape:
     """The type of a variable that holds a value."""
     if isinstance(value, Number):
         return value.kind
-    if isinstance(value, Group):
+    if isinstance(value, ItemList):
         return tuple(shape_of(item) for item in value.items)
     return value
 
@@ -179,7 +179,7 @@ def described(shape: Shape) -> str:
         return f"a list of {len(shape)}"
     if isinstance(shape, Constant):
         return "None" if shape.value is None else f"a constant {type(shape.value).__name__}"
-    if isinstance(shape, Rows):
+    if isinstance(shape, RuntimeList):
         return f"params['{shape.name}']"
     if isinstance(shape, Thing):
         return shape.name
@@ -197,7 +197,7 @@ def codes(value: Value, shape: Any) -> list[str]:
     """C++ texts of all numbers in a value, each cast to its kind in ``shape``."""
     if isinstance(value, Number):
         return [cast(value, shape)]
-    if isinstance(value, Group):
+    if isinstance(value, ItemList):
         return [code for item, kind in zip(value.items, shape, strict=True) for code in codes(item, kind)]
     return []
 
@@ -207,5 +207,5 @@ def rebuilt(shape: Shape, names: list[str]) -> Value:
     if isinstance(shape, str):
         return Number(shape, names.pop(0))
     if isinstance(shape, tuple):
-        return Group(tuple(rebuilt(item, names) for item in shape))
+        return ItemList(tuple(rebuilt(item, names) for item in shape))
     return shape

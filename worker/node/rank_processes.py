@@ -1,4 +1,4 @@
-"""A supervisor's operations on processes: adopt orphans, signal its ranks.
+"""A supervisor's operations on the processes of its ranks: adopt orphans, send signals.
 
 Linux only: it uses ``prctl(2)`` and ``/proc``. Imports no torch.
 """

@@ -1,4 +1,4 @@
-"""A track: a road with a centre line and two borders, a loop as a rule.
+"""A race track: a road with a centre line and two borders, a loop as a rule.
 
 In memory the lines are N different points. The segment from the last one to the first closes those of a loop; in files the first row
 stands at the end once more (N + 1 rows), as the community's tools expect. An open track leads from its first point to its last.

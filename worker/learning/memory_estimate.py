@@ -1,4 +1,4 @@
-"""Whether the worlds fit into memory. Measured on a few worlds, because solver and torch buffer sizes cannot be computed in advance."""
+"""The estimate of memory: whether the worlds fit. Measured on a few worlds, because solver and torch buffer sizes cannot be computed in advance."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import psutil
 import torch
 
-from worker.learning.algorithm import Algorithm, Share
+from worker.learning.algorithm import Algorithm, WorldShare
 from worker.learning.distributed import Gang
 from worker.learning.host_copies import HostCopies
 from worker.learning.setup import build_algorithm, build_task, load_kernels, observed, transition
@@ -118,7 +118,7 @@ def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: 
     alone.size, alone.rank = 1, 0
     gc.collect()
     before = _start_measuring(gang.device)
-    share = Share(0, worlds, worlds)
+    share = WorldShare(0, worlds, worlds)
     task = build_task(task_type, config, share, gang, 0)
     kind, settings = learner
     algorithm = build_algorithm(kind, settings, task, share, alone, 0, rehearsal=True)

@@ -1,6 +1,6 @@
 """Watches a Ray cluster for the engine: a line of JSON each second, ``{"nodes": […], "grows": […], "join": ADDRESS}`` or ``{"error": WHY}``.
 
-``python -m orchestrator.engines.ray.watch HOST:PORT``. A process of its own: Ray aborts one that loses its cluster. It reads the
+``python -m orchestrator.engines.ray.cluster_watch HOST:PORT``. A process of its own: Ray aborts one that loses its cluster. It reads the
 head's tables and is no part of the cluster. It ends when its standard input does, which is when the controller does.
 """
 

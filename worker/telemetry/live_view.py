@@ -1,4 +1,4 @@
-"""``python -m worker.telemetry.view``: show a training as it runs, a checkpoint's policy or a recording in Rerun's web viewer.
+"""``python -m worker.telemetry.live_view``: show a training as it runs, a checkpoint's policy or a recording in Rerun's web viewer.
 
 ``muster view`` starts it. Rerun runs in this process and in its child; a rank never imports it.
 """
@@ -29,12 +29,12 @@ from shared_store.volume.logs import LogLine
 from shared_store.volume.metrics import history_of
 from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.settings.errors import UserError
-from worker.telemetry.page import Page, need_rerun
+from worker.telemetry.page import ViewerPage, need_rerun
 from worker.telemetry.progress import Activity, loading
 from worker.telemetry.rows import Rows
 
 if TYPE_CHECKING:
-    from worker.telemetry.screen import Look, Screen
+    from worker.telemetry.screen import Appearance, Screen
     from worker.telemetry.segment import Segment
     from worker.telemetry.stage import Stage
 
@@ -44,11 +44,11 @@ _LOOK_SECONDS = 0.5
 """Between two looks at metrics and log."""
 _LINES = 200
 """Lines of the log from before the view began."""
-Shown = Callable[[], Page]
+Shown = Callable[[], ViewerPage]
 """Starts the page and says where it is."""
 
 
-class Training:
+class TrainingView:
     """A training of this machine: the newest state of its main rank's first worlds.
 
     Args:
@@ -60,7 +60,7 @@ class Training:
     """
 
     def __init__(self, run: Run, job: str, worlds: int, stop: list[int], activity: Activity) -> None:
-        from worker.telemetry.live import stage_of
+        from worker.telemetry.live_recording import stage_of
         from worker.telemetry.tap_request import PATIENCE, Asking
 
         self._run, self._stop = run, stop
@@ -130,7 +130,7 @@ class Training:
             raise UserError("the training went on with other worlds; start the view again")
         return rows.of_worlds(worlds)
 
-    def _open(self, page: Page, rows: Rows, poses: np.ndarray) -> Screen:
+    def _open(self, page: ViewerPage, rows: Rows, poses: np.ndarray) -> Screen:
         from worker.telemetry.screen import Screen
 
         screen = Screen(page.server, f"training {self._run.name}", look_of(self._stage, rows), poses, live=True)
@@ -160,7 +160,7 @@ class Training:
             screen.say([(time.time_ns(), "muster", text)])
 
 
-class Policy:
+class PolicyView:
     """A checkpoint's policy on fresh worlds of this machine's CPU, in real time.
 
     Args:
@@ -214,7 +214,7 @@ class Policy:
                     print("note: this machine simulates slower than real time", flush=True)
                 time.sleep(max(0.0, ahead))
 
-    def _open(self, page: Page, rows: Rows) -> Screen:
+    def _open(self, page: ViewerPage, rows: Rows) -> Screen:
         from worker.telemetry.screen import Screen
 
         checkpoint, run = self._rollout.checkpoint, self._rollout.run
@@ -241,7 +241,7 @@ class Policy:
             self._sums[world], self._ended[world] = 0.0, self._ended[world] + 1
 
 
-def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int], activity: Activity) -> None:
+def show_file(path: Path, start: Callable[[Path | None], ViewerPage], stop: list[int], activity: Activity) -> None:
     """Show a recording until the user ends it. Raises UserError where it can't be read."""
     if path.suffix == ".rrd":
         with start(_checked(path)) as page:
@@ -277,12 +277,12 @@ def show_file(path: Path, start: Callable[[Path | None], Page], stop: list[int],
         _wait(page, stop)
 
 
-def look_of(stage: Stage, rows: Rows) -> Look:
+def look_of(stage: Stage, rows: Rows) -> Appearance:
     """A stage's worlds, beside each other."""
-    from worker.telemetry.screen import Look
+    from worker.telemetry.screen import Appearance
 
     cameras = tuple(name for name, *_ in rows.layout.images)
-    return Look(tuple(stage.links), stage.meshes(), stage.places(), rows.layout.terms, cameras)
+    return Appearance(tuple(stage.links), stage.meshes(), stage.places(), rows.layout.terms, cameras)
 
 
 def _checked(path: Path) -> Path:
@@ -297,7 +297,7 @@ def _checked(path: Path) -> Path:
     return path
 
 
-def _wait(page: Page, stop: list[int]) -> None:
+def _wait(page: ViewerPage, stop: list[int]) -> None:
     while not stop:
         page.check()
         time.sleep(0.1)
@@ -310,9 +310,9 @@ def _line(line: LogLine) -> tuple[int, str, str]:
     return int(when.timestamp() * 1e6) * 1000, who, line.text
 
 
-def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | None], Page]:
-    def start(file: Path | None) -> Page:
-        page = Page(given.port, given.memory, file, given.framed_by)
+def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | None], ViewerPage]:
+    def start(file: Path | None) -> ViewerPage:
+        page = ViewerPage(given.port, given.memory, file, given.framed_by)
         activity.end()
         print(f"the view is at {page.url}", flush=True)
         if "SSH_CONNECTION" in os.environ:
@@ -328,7 +328,7 @@ def _start(given: argparse.Namespace, activity: Activity) -> Callable[[Path | No
 
 def main() -> int:
     """Read the arguments; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="python -m worker.telemetry.view")
+    parser = argparse.ArgumentParser(prog="python -m worker.telemetry.live_view")
     what = parser.add_mutually_exclusive_group(required=True)
     for name in ("--training", "--policy", "--file"):
         what.add_argument(name, type=Path)
@@ -354,19 +354,21 @@ def main() -> int:
         return 1
 
 
-def _show(given: argparse.Namespace, start: Callable[[Path | None], Page], stop: list[int], activity: Activity) -> int:
+def _show(
+    given: argparse.Namespace, start: Callable[[Path | None], ViewerPage], stop: list[int], activity: Activity
+) -> int:
     if given.file:
         show_file(given.file, start, stop, activity)
         return 0
     source: Any
     if given.training:
-        source = Training(Run(given.training), given.job, given.worlds, stop, activity)
+        source = TrainingView(Run(given.training), given.job, given.worlds, stop, activity)
         os.nice(10)  # where processors are short, frames are fewer, and the training goes on
     else:
         activity.say(loading(Run(given.policy), given.worlds))
         CHANGED_ROBOTS.set(given.accept_changed_robot)
         section = {"checkpoint": given.checkpoint, "accept_changed_robot": given.accept_changed_robot}
-        source = Policy(Run(given.policy), section, given.worlds, given.episodes, stop)
+        source = PolicyView(Run(given.policy), section, given.worlds, given.episodes, stop)
     source.show(lambda: start(None))
     print(f"viewed: {counted(source.frames, 'frame')}", flush=True)
     return 0

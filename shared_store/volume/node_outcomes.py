@@ -1,4 +1,4 @@
-"""The outcome of each node of an attempt, committed by its supervisor before it exits.
+"""The outcomes of an attempt's nodes, each committed by the node's supervisor before it exits.
 
 A controller that was down when a gang ended reads it here, when the engine no longer knows it.
 """

@@ -1,4 +1,4 @@
-"""The rules of definitions and submissions that AWS's service model can't say; each is a ClientException on AWS too."""
+"""Validation of definitions and submissions by the rules that AWS's service model can't say; each is a ClientException on AWS too."""
 
 from __future__ import annotations
 
