@@ -33,7 +33,7 @@ _PARTS = {
 """The classes of attributes and variables on which methods are called that enter a collective."""
 
 
-_CONNECT = "distributed.py:connect"
+_CONNECT = "learning/distributed.py:connect"
 """Forms the gang, and is no path to a collective for those who call it."""
 
 
