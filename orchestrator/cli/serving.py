@@ -14,7 +14,16 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.jobs import SetOption, SpecArgument, check_engine, on_engine, store_here, submit_spec, tell
+from orchestrator.cli.jobs import (
+    SetOption,
+    SpecArgument,
+    check_engine,
+    on_engine,
+    store_here,
+    submit_spec,
+    tell,
+    tell_note,
+)
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
@@ -79,6 +88,8 @@ def run(
         check_engine(name)
     with controller(store, cpus, engine or ()) as connect:
         client = connect()
+        if inherit and (client.found or os.environ.get("MUSTER_URL")):
+            tell_note(f"--inherit: the controller at {client.url} runs already; its own --inherit says what jobs get")
         if engine:
             loaded = on_engine(client, loaded, engine[0], spec)
         job = submit_spec(client, loaded, spec)["jobId"]
