@@ -1,6 +1,6 @@
 """Automatic evaluations: jobs that the controller submits beside a training whose spec has a section ``evaluation``.
 
-The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.batch_models.AutomaticEvaluation`), which changes in
+The progress through a training's checkpoints is a row of the database (:class:`orchestrator.persistence.own_models.AutomaticEvaluation`), which changes in
 the transaction that adds the job: a controller that is killed at any moment neither loses nor doubles an evaluation. A training never
 waits for one, and the reconcile loop neither: this has threads for itself.
 """

@@ -10,8 +10,8 @@ from tests.support.worker.ranks import ROOT
 
 SCRIPT = """
 import sys
-from worker.learning.distributed import Placement, connect
-connect(Placement(), device="cpu")
+from worker.learning.distributed import RankPlacement, connect
+connect(RankPlacement(), device="cpu")
 import torch, tensordict
 import worker.learning.loop
 weight = torch.ones(3, requires_grad=True)

@@ -151,8 +151,8 @@ def test_ranks_that_torchrun_starts_meet_at_its_store(tmp_path: Path) -> None:
     script = tmp_path / "ranks.py"
     script.write_text(
         "import os, torch\n"
-        "from worker.learning.distributed import Placement, connect\n"
-        "gang = connect(Placement.from_env(os.environ), device='cpu')\n"
+        "from worker.learning.distributed import RankPlacement, connect\n"
+        "gang = connect(RankPlacement.from_env(os.environ), device='cpu')\n"
         "total = gang.sum(torch.tensor([gang.rank + 1.0])).item()\n"
         # one write each: two ranks share this pipe
         "os.write(1, f\"sum {total} {gang.tell('from 0' if gang.is_main else None)}\\n\".encode())\n"

@@ -34,8 +34,8 @@ TRAIN = {"task": "Cartpole", "worlds": 16, "iterations": 40, "seed": 5, "config"
 PATIENT = f"""
 import runpy
 from worker.telemetry import tracking_processes
-tracking.READY_SECONDS *= {PATIENCE}
-tracking.FAREWELL["finished"] *= {PATIENCE}
+tracking_processes.READY_SECONDS *= {PATIENCE}
+tracking_processes.FAREWELL["finished"] *= {PATIENCE}
 runpy.run_module("worker.train", run_name="__main__")
 """
 """A training that waits for its services for as long as a busy machine needs to import them."""
