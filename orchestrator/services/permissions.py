@@ -288,8 +288,8 @@ def _whose(thing: Object) -> str:
             return f"log group {thing.name[:200]} was created by {thing.owner or 'the controller'}"
         case JobDefinition():
             return (
-                f"job definition {thing.name} was registered by {thing.owner or 'an unknown key'}; register one under another "
-                f"name, or have it tagged {QUEUES_TAG} with the names of the queues whose keys may submit it"
+                f"job definition {thing.name} was registered by {thing.owner or 'an unknown key'}; register your own "
+                f"revision, or have it tagged {QUEUES_TAG} with the names of the queues whose keys may submit it"
             )
         case _:
             return "it concerns other queues too"
