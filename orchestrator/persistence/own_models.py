@@ -1,16 +1,15 @@
 """The models of what a controller is and keeps: its clock, store, account, keys, secrets, texts, messages, log groups, uses of runs and queues.
 
-Jobs are in :mod:`.batch_models`. SQLAlchemy writes the rows of one flush in the order of these modules' names, so jobs come first, which rows
-here refer to.
+Jobs are in :mod:`.batch_models`.
 """
 
 from __future__ import annotations
 
 from sqlalchemy import ForeignKey, Index
-from sqlalchemy.orm import Mapped, mapped_column, validates
+from sqlalchemy.orm import Mapped, mapped_column, relationship, validates
 
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
-from orchestrator.persistence.batch_models import Base, now
+from orchestrator.persistence.batch_models import Base, Job, now
 from orchestrator.persistence.columns import storable
 
 
@@ -42,6 +41,8 @@ class RunUse(Base):
     __tablename__ = "run_uses"
     job_id: Mapped[str] = mapped_column(ForeignKey("jobs.id", ondelete="CASCADE"), primary_key=True)
     run: Mapped[str] = mapped_column(primary_key=True, index=True)
+    job: Mapped[Job] = relationship()
+    """Never loaded: for it SQLAlchemy writes the job before this row, whatever their classes are called."""
 
 
 class RetentionStart(Base):
