@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -13,6 +15,7 @@ from tests.support.pages import repository_files
 PAGES = sorted(REPOSITORY / name for name in repository_files("*.md"))
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 """Of a page or a picture."""
+IMPORT = re.compile(r"^from ((?:orchestrator|racer|shared_store|worker)[\w.]*) import (\([^)]*\)|.+)$", re.MULTILINE)
 
 
 def prose(page: Path) -> str:
@@ -55,3 +58,19 @@ def test_every_page_can_be_reached_from_the_readme() -> None:
 
 def test_the_readme_is_short() -> None:
     assert len((REPOSITORY / "README.md").read_text().splitlines()) <= 150
+
+
+def test_what_the_pages_import_is_there() -> None:
+    named = {
+        (module, name)
+        for page in PAGES
+        for module, names in IMPORT.findall(page.read_text())
+        for name in re.findall(r"(\w+)(?: as \w+)?", re.sub(r"#.*", "", names))
+    }
+    assert len(named) > 50
+    for module, name in named:
+        try:
+            found = getattr(import_module(module), name, None)
+        except ModuleNotFoundError:
+            found = None
+        assert found is not None or find_spec(f"{module}.{name}") is not None, f"{module}.{name}"

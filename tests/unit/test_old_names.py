@@ -13,7 +13,6 @@ import pytest
 import shared_store
 import worker
 from tests.conftest import REPOSITORY
-from tests.support.pages import repository_files
 
 NAMES = {
     **{old: new for old, new in (shared_store.OLD_NAMES | worker.OLD_NAMES).items() if not new.startswith("racer.")},
@@ -25,7 +24,6 @@ DOCUMENTED = [
     if find_spec("racer") or not name.startswith("worker.racer")
 ]
 """What pages named before modules moved: modules, and their members behind a colon or a dot."""
-IMPORT = re.compile(r"^from ((?:orchestrator|racer|shared_store|worker)[\w.]*) import (\([^)]*\)|.+)$", re.MULTILINE)
 
 
 @pytest.mark.parametrize(("old", "new"), NAMES.items())
@@ -68,15 +66,3 @@ def find(name: str) -> Any:
 @pytest.mark.parametrize("name", DOCUMENTED)
 def test_what_a_page_once_named_is_there(name: str) -> None:
     assert find(name) is not None
-
-
-def test_what_the_pages_import_today_is_there() -> None:
-    named = {
-        f"{module}:{name}"
-        for page in repository_files("*.md")
-        for module, names in IMPORT.findall((REPOSITORY / page).read_text())
-        for name in re.findall(r"(\w+)(?: as \w+)?", re.sub(r"#.*", "", names))
-    }
-    assert len(named) > 50
-    for name in named:
-        assert find(name) is not None, name
