@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import re
-import secrets
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -229,6 +228,8 @@ class Store:
 
     def _name(self, description: dict[str, Any]) -> dict[str, Any]:
         """Give the store an identity. Of several controllers that do so at once, the first one's stays."""
+        import secrets  # every command imports this module, and few need them
+
         claim = self.path / ".naming"
         try:
             with open(claim, "xb") as file:
