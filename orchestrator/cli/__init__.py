@@ -10,12 +10,17 @@ import sys
 
 import typer
 
-from orchestrator.cli.catalogue import ENTRIES, Catalogue, add_placeholders
 from orchestrator.cli.misuse import Misuse, told
 from orchestrator.cli.terminal import echo, log_visibly, one_line
 from orchestrator.domain.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
 from shared_store import __version__
+from shared_store.contract.plugins import PluginError
 from shared_store.volume.layout import StoreError
+
+try:
+    from orchestrator.cli.catalogue import ENTRIES, Catalogue, add_placeholders
+except PluginError as error:  # before there is any command
+    sys.exit(f"muster: {error}")
 
 app = typer.Typer(
     name="muster",

@@ -122,7 +122,7 @@ def load(place: str) -> Any:
     module, _, name = place.partition(":")
     try:
         return getattr(import_module(module), name)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # of somebody's code, which may do anything
         raise PluginError(
             f"plug-in: {place} can't be imported ({error}); install its package again, or remove it"
         ) from error

@@ -93,3 +93,12 @@ print(json.dumps([task.__name__, load(plugins()["notes"].bundle_parts)(task.__ne
     env = {**os.environ, "PYTHONPATH": str(installed)}
     told = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
     assert json.loads(told.splitlines()[-1]) == ["ShortCartpole", {"notes.json": {"task": "ShortCartpole"}}]
+
+
+def test_a_plugin_that_can_t_be_imported_ends_a_command_with_one_line(tmp_path: Path) -> None:
+    (tmp_path / "broken-1.dist-info").mkdir()
+    (tmp_path / "broken-1.dist-info" / "entry_points.txt").write_text("[muster.plugins]\nbroken = broken:PLUGIN\n")
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    done = run_muster("--help", home=tmp_path, PYTHONPATH=str(tmp_path))
+    words = "plug-in: broken:PLUGIN can't be imported (division by zero); install its package again, or remove it"
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"muster: {words}\n")
