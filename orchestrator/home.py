@@ -144,9 +144,9 @@ class HomeLock:
         """Tell commands on this machine where the controller listens, whether it goes away with the command that started it, its AWS
         region, and its database (without a password).
         """
-        told = {"pid": os.getpid(), "url": url, "temporary": temporary, "region": region, "database": database}
+        published = {"pid": os.getpid(), "url": url, "temporary": temporary, "region": region, "database": database}
         try:
-            self.path.write_text(json.dumps(told))
+            self.path.write_text(json.dumps(published))
         except OSError as error:
             log.warning("%s can't be written (%s); commands need MUSTER_URL=%s", self.path, error.strerror, url)
 

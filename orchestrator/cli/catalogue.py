@@ -17,92 +17,92 @@ from shared_store.contract.plugins import Command, plugins
 from shared_store.contract.plugins import load as load_part
 
 
-def Entry(name: str, module: str, panel: str, summary: str) -> Command:
+def _own(name: str, module: str, panel: str, summary: str) -> Command:
     """A command of Muster; ``module``: in ``orchestrator.cli``."""
     return Command(name, f"orchestrator.cli.{module}", panel, summary)
 
 
 _JOBS, _RUNS, _SHARED, _HERE = "Jobs", "Runs", "Controller", "This machine"
 ENTRIES = (
-    Entry(
+    _own(
         "run",
         "serving",
         _JOBS,
         "Run a job to its end, with a temporary controller if none is running; exit with its result.",
     ),
-    Entry("submit", "jobs", _JOBS, "Submit a job to a running controller."),
-    Entry("list", "listing", _JOBS, "List jobs, the newest first."),
-    Entry("show", "show", _JOBS, "Show a job: its state and the reason, its attempts and nodes, its run and results."),
-    Entry("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
-    Entry("stop", "jobs", _JOBS, "Stop a job: it checkpoints and exits; `muster resume` continues from there."),
-    Entry("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),
-    Entry("runs", "stored_runs", _RUNS, "List, archive and delete the runs of the store."),
-    Entry("resume", "runs", _RUNS, "Resume a run from its newest checkpoint, at the next iteration."),
-    Entry("clone", "clones", _RUNS, "Start a new run from only the weights of a checkpoint."),
-    Entry(
+    _own("submit", "jobs", _JOBS, "Submit a job to a running controller."),
+    _own("list", "listing", _JOBS, "List jobs, the newest first."),
+    _own("show", "show", _JOBS, "Show a job: its state and the reason, its attempts and nodes, its run and results."),
+    _own("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
+    _own("stop", "jobs", _JOBS, "Stop a job: it checkpoints and exits; `muster resume` continues from there."),
+    _own("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),
+    _own("runs", "stored_runs", _RUNS, "List, archive and delete the runs of the store."),
+    _own("resume", "runs", _RUNS, "Resume a run from its newest checkpoint, at the next iteration."),
+    _own("clone", "clones", _RUNS, "Start a new run from only the weights of a checkpoint."),
+    _own(
         "evaluate",
         "evaluations",
         _RUNS,
         "Evaluate a checkpoint: whole episodes in worlds that its training has not seen.",
     ),
-    Entry(
+    _own(
         "compare",
         "comparing",
         _RUNS,
         "Compare runs, or groups of runs that differ only in their seed; draw their curves.",
     ),
-    Entry(
+    _own(
         "export",
         "export",
         _RUNS,
         "Export a policy as a bundle for a robot (ONNX, contract, self-test), checked against the policy.",
     ),
-    Entry(
+    _own(
         "models",
         "models",
         _RUNS,
         "Manage exported policies: register, list, show, diff, verify. Versions are immutable.",
     ),
-    Entry("checkpoint", "jobs", _RUNS, "Make a training job save now; return when the checkpoint is durable."),
-    Entry("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify, exit 1 if one is damaged."),
-    Entry("record", "recordings", _RUNS, "Record a policy in action as an MCAP file, for ROS 2's tools and viewers."),
-    Entry(
+    _own("checkpoint", "jobs", _RUNS, "Make a training job save now; return when the checkpoint is durable."),
+    _own("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify, exit 1 if one is damaged."),
+    _own("record", "recordings", _RUNS, "Record a policy in action as an MCAP file, for ROS 2's tools and viewers."),
+    _own(
         "render", "recordings", _RUNS, "Film a checkpoint's policy in action, or show six moments of it in a picture."
     ),
-    Entry("view", "viewing", _RUNS, "View a running training, a checkpoint's policy or a recording in a browser."),
-    Entry(
+    _own("view", "viewing", _RUNS, "View a running training, a checkpoint's policy or a recording in a browser."),
+    _own(
         "verify-resume",
         "verify",
         _RUNS,
         "Prove that a training survives a crash: train twice, kill one, compare the results bit by bit.",
     ),
-    Entry(
+    _own(
         "serve",
         "serving",
         _SHARED,
         "Run the controller as a server. Running jobs outlive it; the next controller finds them.",
     ),
-    Entry(
+    _own(
         "queues",
         "queues",
         _SHARED,
         "List job queues, or one queue's waiting jobs in the order in which they will start.",
     ),
-    Entry("gc", "gc", _SHARED, "Delete old jobs, their logs and their runs, where nothing needs them any more."),
-    Entry("keys", "keys", _SHARED, "Manage the access keys of this home directory's server."),
-    Entry("webhooks", "webhooks", _SHARED, "List and test the controller's webhooks, which report the end of jobs."),
-    Entry(
+    _own("gc", "gc", _SHARED, "Delete old jobs, their logs and their runs, where nothing needs them any more."),
+    _own("keys", "keys", _SHARED, "Manage the access keys of this home directory's server."),
+    _own("webhooks", "webhooks", _SHARED, "List and test the controller's webhooks, which report the end of jobs."),
+    _own(
         "aws", "aws", _SHARED, "Manage the CloudFormation stack for jobs on AWS (network, volume, images, AWS Batch)."
     ),
-    Entry(
+    _own(
         "tasks",
         "tasks",
         _HERE,
         "List the installed tasks, or all terms and numbers of one task.",
     ),
-    Entry("robot", "robot", _HERE, "Show a robot's file as a task would load it, beside MuJoCo's own reading."),
-    Entry("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors, or of the policy contract."),
-    Entry(
+    _own("robot", "robot", _HERE, "Show a robot's file as a task would load it, beside MuJoCo's own reading."),
+    _own("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors, or of the policy contract."),
+    _own(
         "doctor",
         "doctor",
         _HERE,

@@ -72,12 +72,12 @@ def evaluate(
         "seed": seed,
         "accept_changed_robot": accept_changed_robot or None,
     }
-    asked = Asked(source, section, set_ or (), name, engine, store, cpus, as_json)
-    raise typer.Exit(follow_evaluation(asked))
+    request = EvaluationRequest(source, section, set_ or (), name, engine, store, cpus, as_json)
+    raise typer.Exit(follow_evaluation(request))
 
 
 @dataclass(frozen=True)
-class Asked:
+class EvaluationRequest:
     """What a user asks of an evaluation.
 
     Attributes:
@@ -103,11 +103,11 @@ class Asked:
     kind: str = "evaluate"
 
 
-def follow_evaluation(asked: Asked, then: Callable[[Path, str], None] | None = None) -> int:
+def follow_evaluation(request: EvaluationRequest, then: Callable[[Path, str], None] | None = None) -> int:
     """Submit an evaluation and follow it to its end.
 
     Args:
-        asked: The evaluation.
+        request: The evaluation.
         then: Called after success with the run's directory and the evaluation's name.
 
     Returns:
@@ -116,20 +116,20 @@ def follow_evaluation(asked: Asked, then: Callable[[Path, str], None] | None = N
     Raises:
         UsageError, SpecError, ApiError, ServerError: One line each.
     """
-    run, checkpoint = split_reference(asked.source)
-    section = {key: value for key, value in {"checkpoint": checkpoint, **asked.section}.items() if value is not None}
-    with controller(asked.store, asked.cpus) as connect:
+    run, checkpoint = split_reference(request.source)
+    section = {key: value for key, value in {"checkpoint": checkpoint, **request.section}.items() if value is not None}
+    with controller(request.store, request.cpus) as connect:
         client = connect()
-        elsewhere = on_queue(asked.changes, None if asked.engine is None else engine_queue(client, asked.engine))
-        spec = _spec(client, named(run), asked.name, section, asked.changes, elsewhere, asked.kind)
-        job = submit_spec(client, spec, f"evaluate {asked.source}")["jobId"]
-        code = see_through(client, job, await_end if asked.as_json else _told)
-        if code == 0 and (asked.as_json or then):
+        elsewhere = on_queue(request.changes, None if request.engine is None else engine_queue(client, request.engine))
+        spec = _spec(client, named(run), request.name, section, request.changes, elsewhere, request.kind)
+        job = submit_spec(client, spec, f"evaluate {request.source}")["jobId"]
+        code = see_through(client, job, await_end if request.as_json else _told)
+        if code == 0 and (request.as_json or then):
             found = client.get(f"/api/runs/{named(run)}/evaluations")
             summary = next(each for each in found if each.get("job") == job)
             if then:
                 then(Path(client.get(f"/api/runs/{named(run)}")["path"]), summary["name"])
-            if asked.as_json:
+            if request.as_json:
                 echo_json(summary, indent=1)
     return code
 

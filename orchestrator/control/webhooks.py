@@ -117,7 +117,7 @@ def kind_of(job: Job) -> str:
 
 
 def run_of(job: Job) -> str:
-    """The run that a job trains, or of which it evaluates, exports, records or renders a checkpoint."""
+    """The run that a job trains, or whose checkpoint it evaluates, exports, records or renders."""
     section = _spec(job).get(kind_of(job))
     named = section.get("run") if isinstance(section, dict) else None
     return named if isinstance(named, str) and NAME.fullmatch(named) else job.run

@@ -21,6 +21,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError
+from orchestrator.domain.identifiers import ACCESS_KEY_ID, SHARE
 from orchestrator.persistence.own_models import AccessKey
 from orchestrator.persistence.own_secrets import OwnSecrets
 from orchestrator.persistence.sealing import SealError
@@ -31,7 +32,6 @@ INTERVAL = 1.0
 PATIENCE = 2.0
 """Seconds for which a caller with an unknown key waits for the database."""
 _NAME_PATTERN = f"^(?:{NAME.pattern})$"
-_SHARE = r"[A-Za-z0-9]{1,255}"
 _ID_LETTERS = string.ascii_uppercase + "234567"
 _SECRET_LETTERS = string.ascii_letters + string.digits
 """No punctuation: a secret can be pasted into a shell, an INI file and a bearer header as it is (40 letters: 238 bits)."""
@@ -53,12 +53,12 @@ class Key(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", alias_generator=to_camel, validate_by_name=True)
     name: str = Field(pattern=_NAME_PATTERN)
-    access_key_id: str = Field(pattern=r"^[A-Z0-9]{16,128}$")
+    access_key_id: str = Field(pattern=f"^{ACCESS_KEY_ID}$")
     secret: str = Field(pattern=r"^[!-~]{16,256}$", repr=False)
     queues: tuple[str, ...] | None = None
     """Names of the queues that it may use; None: all."""
     read_only: bool = False
-    share: str = Field(default_factory=lambda key: share_of_name(key.get("name", "")), pattern=f"^{_SHARE}$")
+    share: str = Field(default_factory=lambda key: share_of_name(key.get("name", "")), pattern=f"^{SHARE}$")
     """Share identifier of its jobs in queues with a fair-share policy."""
     created_at: int
     """Milliseconds since 1970."""
@@ -157,7 +157,7 @@ class KeyStore:
         for queue in queues or ():
             if not NAME.fullmatch(queue):
                 raise KeyUsageError(f"--queue {queue!r}: give the name of a queue, such as default")
-        if share is not None and not re.fullmatch(_SHARE, share):
+        if share is not None and not re.fullmatch(SHARE, share):
             raise KeyUsageError(f"--share {share[:100]!r}: 1 to 255 letters and digits")
         key = Key(
             name=name,

@@ -16,6 +16,7 @@ from orchestrator.control.compute_environments import queue_engines
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.identifiers import SHARE
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
 from orchestrator.persistence import log_groups
@@ -140,7 +141,7 @@ def open_queue(context: Context, queue: JobQueue, share: str | None, priority: i
         share = own
     if queue.policy is not None and not share:
         raise ClientError(f"Job queue {queue.name} has a fair share scheduling policy: give a shareIdentifier")
-    if share is not None and not re.fullmatch(r"[A-Za-z0-9]{1,255}\*?", share):
+    if share is not None and not re.fullmatch(rf"{SHARE}\*?", share):
         raise ClientError(f"shareIdentifier {share[:100]!r}: 1 to 255 letters and digits, a * at the end at most")
     if priority is not None and not 0 <= priority <= _MOST_PRIORITY:
         raise ClientError(f"schedulingPriorityOverride is {priority}; it must be 0 to {_MOST_PRIORITY}")

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from orchestrator.domain.gang import MOST_NODES
+from orchestrator.domain.identifiers import SHARE
 from orchestrator.spec.values import Memory, RunName, Section, Size
 from shared_store.contract.node import LEAST_LOG_LIMIT, LOG_LIMIT
 
@@ -18,7 +19,7 @@ ACCEPT = Field(
 )
 CheckpointName = int | Literal["best", "latest"]
 """An iteration, or what ``RUN@best`` and ``RUN@latest`` mean."""
-Share = Annotated[str, Field(pattern=r"^[A-Za-z0-9]{1,255}$")]
+Share = Annotated[str, Field(pattern=f"^{SHARE}$")]
 
 
 class NodeRange(Section):

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.catalogue import FurtherOptions
-from orchestrator.cli.evaluations import Asked, follow_evaluation
+from orchestrator.cli.evaluations import EvaluationRequest, follow_evaluation
 from orchestrator.cli.terminal import echo
 from orchestrator.domain.errors import ServerError, UsageError
 from racer.store.races import BESIDE, SIM_TRACE
@@ -81,13 +81,13 @@ def race_or_evaluate(
         "accept_changed_robot": given["accept_changed_robot"] or None,
     }
     place = {key: given[key] for key in ("source", "name", "engine", "store", "cpus", "as_json")}
-    asked = Asked(section=section, changes=given["set_"] or (), kind="race", **place)
+    request = EvaluationRequest(section=section, changes=given["set_"] or (), kind="race", **place)
 
     def copy(run: Path, evaluation: str) -> None:
         if output is not None:
-            _copy(run, evaluation, output, asked.as_json)
+            _copy(run, evaluation, output, request.as_json)
 
-    raise typer.Exit(follow_evaluation(asked, copy))
+    raise typer.Exit(follow_evaluation(request, copy))
 
 
 OPTIONS = FurtherOptions(

@@ -11,12 +11,12 @@ from dataclasses import dataclass, field
 from hashlib import sha256
 
 from orchestrator.api.http.callers import user_name
+from orchestrator.domain.identifiers import ACCESS_KEY_ID
 from orchestrator.persistence.access_keys import Key, KeyStore
 from orchestrator.services.permissions import CONTROLLER, Actor, Refusal
 
 SESSION = 12 * 3600
 """Seconds for which a login to the console lasts."""
-_ID = re.compile("[A-Z0-9]{16,128}")
 _TOKEN = "token"
 """In a session, in place of an access key id: it was opened with MUSTER_TOKEN."""
 
@@ -46,7 +46,11 @@ class Access:
 
     def is_new(self, access_key_id: str) -> bool:
         """Whether another process may just have made the key of this id: then :meth:`look_again` before it is refused."""
-        return self.keys is not None and access_key_id not in self.known() and bool(_ID.fullmatch(access_key_id))
+        return (
+            self.keys is not None
+            and access_key_id not in self.known()
+            and bool(re.fullmatch(ACCESS_KEY_ID, access_key_id))
+        )
 
     def look_again(self) -> None:
         """Read the keys of the database; the caller's thread may wait for it."""

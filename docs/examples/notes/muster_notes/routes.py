@@ -39,7 +39,7 @@ def add_note(request: Request, run: str, body: Note) -> dict[str, str]:
 @router.get("/notes/secret")
 def forgotten() -> str:
     """Not among the operations of the plug-in: refused for every key."""
-    return "nobody reads this"
+    return "secret"
 
 
 @pages.get("/notes")
