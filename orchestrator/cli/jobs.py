@@ -109,7 +109,10 @@ def submit(
     name: Annotated[str | None, typer.Option(help="Of the job, and of its run, instead of the spec's.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Submit a job to a running controller."""
+    """Submit a job to a running controller.
+
+    Of the machine's environment it gets what programs need, and what `muster serve --inherit NAME` names; environment: of the YAML adds values.
+    """
     loaded = specfile.load(spec, [*(set_ or ()), *called(set_, name)], store_here)
     tell(loaded)
     with Client.connect() as client:

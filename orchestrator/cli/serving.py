@@ -57,7 +57,7 @@ InheritOption = Annotated[
         "--inherit",
         metavar="NAME",
         envvar=INHERIT,
-        help="Variable of this environment that jobs on the engines local, ray and slurm get, too, such as WANDB_API_KEY. Repeatable.",
+        help="Variable that jobs get, too, such as WANDB_API_KEY: of this environment (local, slurm), of the node's (ray). Repeatable.",
         show_default=False,
         show_envvar=False,
     ),
@@ -66,7 +66,7 @@ InheritOption = Annotated[
 
 def register(app: typer.Typer) -> None:
     app.command(epilog="Example:  muster run job_specs/cartpole.yaml --set train.iterations=100")(run)
-    app.command(epilog="Example:  muster serve --store /mnt/efs/muster")(serve)
+    app.command(epilog="Examples:  muster serve --store /mnt/efs/muster;  muster serve --inherit WANDB_API_KEY")(serve)
 
 
 def run(
@@ -101,10 +101,12 @@ def have_inherited(names: Sequence[str] | None) -> None:
     """Let jobs have these variables of this process. Raises UsageError for a name that no variable can have, and for the controller's own."""
     for name in names or ():
         if not name.isidentifier():
-            raise UsageError(f"--inherit {name[:100]}: give the name of a variable, such as WANDB_API_KEY")
+            raise UsageError(
+                f"--inherit, or {INHERIT}: {name[:100]}: give the name of a variable, such as WANDB_API_KEY"
+            )
         if name in PRIVATE:
             raise UsageError(
-                f"--inherit {name}: it is the controller's own; jobs get credentials by secrets: in their YAML"
+                f"--inherit, or {INHERIT}: {name} is the controller's own; jobs get credentials by secrets: in their YAML"
             )
     os.environ[INHERIT] = " ".join(names or ())
 

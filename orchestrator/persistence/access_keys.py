@@ -91,6 +91,8 @@ class KeyStore:
         self._looking = threading.Lock()
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
+        self._is_failing = False
+        """Whether the last look failed as none should: one line of the log says so."""
         self._looked = 0.0
         """When the last look began (monotonic [s])."""
         self._rows: Sequence[Row[Any]] = ()
@@ -159,6 +161,11 @@ class KeyStore:
                 raise KeyUsageError(f"--queue {queue!r}: give the name of a queue, such as default")
         if share is not None and not re.fullmatch(SHARE, share):
             raise KeyUsageError(f"--share {share[:100]!r}: 1 to 255 letters and digits")
+        others = {each.share: each.name for each in self.load().values() if each.name != name}
+        if share is None and (other := others.get(share_of_name(name))):
+            raise KeyUsageError(
+                f"key {name} would have the share of key {other}: --share {share_of_name(name)} shares it, another name does not"
+            )
         key = Key(
             name=name,
             access_key_id="MSTR" + "".join(secrets.choice(_ID_LETTERS) for _ in range(16)),
@@ -199,8 +206,13 @@ class KeyStore:
     def _look_safely(self) -> None:
         try:
             self._look()
+            self._is_failing = False
         except Unavailable:
             pass  # said by the controller; the keys that were read last stay in force
+        except Exception:  # whatever it was, the next look sees keys that are deleted meanwhile
+            if not self._is_failing:
+                log.exception("the keys can't be read; those that were read last stay in force")
+            self._is_failing = True
 
     def _look(self) -> None:
         """Read the rows, and open them where they have changed."""

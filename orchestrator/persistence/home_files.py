@@ -51,6 +51,7 @@ def move_in(home: Path, own: OwnSecrets, keys: KeyStore) -> None:
     keys.load()
     try:
         for path in files:
+            path.chmod(0o600)
             path.rename(path.with_name(path.name + _MOVED))
         (home / "keys.lock").unlink(missing_ok=True)
         sync_directory(home)

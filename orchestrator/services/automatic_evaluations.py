@@ -236,7 +236,7 @@ class AutomaticEvaluations:
         try:
             actor = self._actor_named(training.owner)
             if actor is None:
-                raise ClientError(f"{training.owner}, which submitted the training, is no longer there")
+                raise ClientError(f"{training.owner}, which submitted the training, has no access any more")
             # a key's share is the key's, whatever the training's was called when it was submitted
             place = {key: value for key, value in training.place.items() if key != "share" or actor.share is None}
             spec = automatic_evaluation(run.name, training.spec, place, training.wanted, chosen.iteration)

@@ -97,9 +97,9 @@ class Access:
         return Actor("MUSTER_TOKEN") if name == _TOKEN else actor_of_key(self.known()[name])
 
     def actor_named(self, name: str) -> Actor | None:
-        """The actor of this name with the rights that it has now; None where its key is gone."""
+        """The actor of this name with the rights that it has now; None where it has none any more."""
         if not name.startswith("key "):
-            return Actor(name)
+            return actor if self.still_admits(actor := Actor(name), "") else None
         return next((actor for key in self.known().values() if (actor := actor_of_key(key)).name == name), None)
 
     def still_admits(self, actor: Actor, session: str) -> bool:

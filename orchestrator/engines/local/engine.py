@@ -209,7 +209,7 @@ class LocalEngine:
         return f"{self._groups}/{_group_name(gang, index)}" if self._groups else ""
 
     def _process(self, gang: Gang, node: NodePlan) -> NodeProcess:
-        own = inherited(["SLURM_JWT"])
+        own = inherited()
         environment = {
             **own,
             "PATH": f"{Path(sys.executable).parent}:{own.get('PATH', '/usr/bin:/bin')}",

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from orchestrator.engines.api import EngineError
-from orchestrator.engines.toolkit.environment import inherited
+from orchestrator.engines.toolkit.environment import INHERIT, inherited
 from orchestrator.engines.toolkit.view import View
 
 _FRESH = 8.0
@@ -102,7 +102,7 @@ def _why_no_watch(code: int, errors: Sequence[str]) -> str:
 
 def ray_environment(head: str) -> dict[str, str]:
     """For a process that imports Ray: always with an explicit word about the token, since Ray aborts where sides differ."""
-    own = inherited(prefixes=("PG",), kept=("RAY_AUTH_TOKEN",))
+    own = inherited(prefixes=("PG",), kept=("RAY_AUTH_TOKEN", INHERIT))
     known = any(own.get(name) for name in ("RAY_AUTH_TOKEN", "RAY_AUTH_TOKEN_PATH"))
     mode = "token" if known or (Path.home() / ".ray" / "auth_token").exists() else "disabled"
     return {"RAY_AUTH_MODE": mode, **own, "RAY_ADDRESS": head, "RAY_USAGE_STATS_ENABLED": "0"}

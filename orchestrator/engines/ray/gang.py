@@ -16,6 +16,7 @@ from orchestrator.engines.api import Cause
 from orchestrator.engines.ray import node as ray_node
 from orchestrator.engines.ray.folder import LEASE, Folder
 from orchestrator.engines.ray.placement_groups import bundle_of
+from orchestrator.engines.toolkit.environment import named_variables
 from shared_store import __version__
 from shared_store.contract.node import NodeContract
 from shared_store.process.ports import first_port
@@ -158,6 +159,7 @@ class DrivenGang:
                 contract.to_env(),
                 node["gpus"],
                 self.plan["directory"],
+                named_variables(),
             )
             self.asked[ref] = ("start", index)
             self.nodes[index]["address"] = addresses[index]

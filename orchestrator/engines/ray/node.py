@@ -17,8 +17,8 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-_OF_RAY = ("RAY_", "OMP_NUM_THREADS", "PYTHONBREAKPOINT", "SPT_NOENV", "GRPC_DEFAULT_SSL_ROOTS_FILE_PATH")
-"""Variables of a Ray worker that its node's command does not get."""
+_OF_RAY = ("OMP_NUM_THREADS", "PYTHONBREAKPOINT")
+"""Variables that Ray sets in its workers; a node's command does not get them."""
 
 
 class Node:
@@ -80,6 +80,7 @@ class Node:
         contract: Mapping[str, str],
         gpus: int,
         directory: str | None,
+        named: Sequence[str] = (),
     ) -> str:
         """Start the supervisor; returns why it could not be started, or nothing.
 
@@ -90,13 +91,16 @@ class Node:
             contract: The node contract, which goes over both.
             gpus: How many GPUs the node has; which ones is for Ray to say.
             directory: Working directory.
+            named: Variables of this machine that the controller's ``--inherit`` names.
         """
-        inherited = {name: value for name, value in os.environ.items() if not name.startswith(_OF_RAY)}
-        from shared_store.contract.node import sealed  # it is there by now, and of the same version: see facts()
+        # Muster is here by now, and of the same version: see facts()
+        from orchestrator.engines.toolkit.environment import inherited, named_variables
+        from shared_store.contract.node import sealed
 
+        own = inherited(_OF_RAY, ("RAY_",), named=[*named_variables(), *named])
         environment = {
-            **inherited,
-            "PATH": f"{os.path.dirname(sys.executable)}:{inherited.get('PATH', '/usr/bin:/bin')}",
+            **own,
+            "PATH": f"{os.path.dirname(sys.executable)}:{own.get('PATH', '/usr/bin:/bin')}",
             "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "") if gpus else "",
             **sealed(user, contract),
         }

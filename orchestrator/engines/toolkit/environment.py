@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection
 
 INHERIT = "MUSTER_INHERIT"
@@ -10,37 +11,50 @@ INHERIT = "MUSTER_INHERIT"
 PRIVATE = (
     *("MUSTER_TOKEN", "MUSTER_URL", "MUSTER_KILL_AT", "MUSTER_DATABASE", "PGPASSWORD", "PGPASSFILE", INHERIT),
     *("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY", "AWS_SESSION_TOKEN", "AWS_SECURITY_TOKEN"),
-    *("AWS_CONTAINER_AUTHORIZATION_TOKEN", "RAY_AUTH_TOKEN"),
+    *("AWS_CONTAINER_AUTHORIZATION_TOKEN", "RAY_AUTH_TOKEN", "SLURM_JWT"),
 )
 """Variables of the controller that jobs don't get, whoever names them: its credentials for the database and the engines."""
 COMMON = (
     *("PATH", "HOME", "USER", "LOGNAME", "SHELL", "HOSTNAME", "TZ", "LANG", "LANGUAGE", "TERM", "TMPDIR", "PWD"),
     *("VIRTUAL_ENV", "LD_LIBRARY_PATH", "LD_PRELOAD", "DISPLAY", "MUJOCO_GL", "PYOPENGL_PLATFORM"),
-    *("http_proxy", "https_proxy", "no_proxy", "HTTP_PROXY", "HTTPS_PROXY", "NO_PROXY"),
-    *("SSL_CERT_FILE", "SSL_CERT_DIR", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE"),
+    *("http_proxy", "https_proxy", "ftp_proxy", "no_proxy", "all_proxy"),
+    *("HTTP_PROXY", "HTTPS_PROXY", "FTP_PROXY", "NO_PROXY", "ALL_PROXY"),
+    *("SSL_CERT_FILE", "SSL_CERT_DIR", "REQUESTS_CA_BUNDLE", "CURL_CA_BUNDLE", "AWS_CA_BUNDLE", "PIP_CERT"),
+    *("GIT_SSL_CAINFO", "NODE_EXTRA_CA_CERTS"),
 )
 """Variables without which programs do not find their files, their libraries or the network."""
 FAMILIES = (
-    *("LC_", "XDG_", "PYTHON", "CONDA", "PIP_", "MUSTER_", "WARP_", "NEWTON_", "TORCH", "PYTORCH_", "CUDA_", "NVIDIA_"),
+    *("LC_", "XDG_", "PYTHON", "CONDA", "MUSTER_", "WARP_", "NEWTON_", "TORCH", "PYTORCH_", "CUDA_", "NVIDIA_"),
     *("NCCL_", "GLOO_", "TP_", "OMP_", "MKL_", "OPENBLAS_", "KMP_", "RAY_", "ROS_", "RMW_", "ZENOH_"),
 )
 """What the names of the settings of interpreters, libraries and Muster itself begin with."""
+_SECRET = re.compile(r"(KEY|TOKEN|PASSWORD|PASSWD|SECRET|CREDENTIAL)S?$")
+"""How the names of secrets end: such a variable is inherited only if somebody names it, whatever its family."""
+
+
+def named_variables() -> list[str]:
+    """The variables that ``--inherit`` names, without those that are the controller's own."""
+    return [name for name in os.environ.get(INHERIT, "").split() if name not in PRIVATE]
 
 
 def inherited(
-    withheld: Collection[str] = (), prefixes: tuple[str, ...] = (), kept: Collection[str] = ()
+    withheld: Collection[str] = (),
+    prefixes: tuple[str, ...] = (),
+    kept: Collection[str] = (),
+    named: Collection[str] | None = None,
 ) -> dict[str, str]:
     """This process's variables that jobs may have.
 
     Args:
-        withheld: Names that are left out, too.
+        withheld: Names that are left out, too, unless somebody names them.
         prefixes: So is what begins with one of these.
         kept: Names that stay all the same, private or not.
+        named: Others that jobs get; None: :func:`named_variables`.
     """
-    named = set(os.environ.get(INHERIT, "").split()) - {*PRIVATE}
+    added = {*(named_variables() if named is None else named), *kept}
 
     def is_common(name: str) -> bool:
-        known = name in COMMON or name.startswith(FAMILIES)
+        known = name in COMMON or (name.startswith(FAMILIES) and not _SECRET.search(name))
         return known and name not in PRIVATE and name not in withheld and not name.startswith(prefixes)
 
-    return {name: value for name, value in os.environ.items() if name in kept or name in named or is_common(name)}
+    return {name: value for name, value in os.environ.items() if name in added or is_common(name)}

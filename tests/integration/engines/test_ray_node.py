@@ -67,6 +67,26 @@ def test_a_stopped_node_leaves_nothing_and_names_a_process_that_can_not_be_kille
     node.wait()
 
 
+PRINT_ENVIRONMENT = "import os; print(*sorted(os.environ))"
+
+
+def test_a_node_has_of_its_machine_s_variables_what_programs_need_and_what_somebody_names(
+    contract: NodeContract, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("HF_TOKEN", "WANDB_API_KEY", "KUBECONFIG", "RAY_JOB_ID", "NCCL_DEBUG"):
+        monkeypatch.setenv(name, "value")
+    monkeypatch.setenv("MUSTER_INHERIT", "KUBECONFIG")
+    node = Node({"MUSTER_GANG": contract.gang, "NODE_RANK": "0"}, 1e9)
+    command = [sys.executable, "-c", PRINT_ENVIRONMENT]
+    assert node.start([], command, {"MINE": "1"}, contract.to_env(), 0, None, ["HF_TOKEN"]) == ""
+    assert node.wait() == (0, "")
+    printed = [line.text for line in LogView.of(Store(contract.store).run("run"), "ray-node").drain()]
+    found = {name for line in printed for name in line.split()}
+    assert {"HF_TOKEN", "KUBECONFIG", "NCCL_DEBUG", "MINE", "PATH"} <= found
+    assert not found & {"WANDB_API_KEY", "RAY_JOB_ID", "MUSTER_INHERIT"}
+    node.stop(1.0)
+
+
 def test_a_node_leaves_nothing_when_its_actor_is_killed(contract: NodeContract) -> None:
     command = [sys.executable, "-P", "-c", ACTOR, json.dumps(contract.to_env()), "sh", "-c", ESCAPE]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as actor:

@@ -422,3 +422,5 @@ def test_jobs_inherit_no_secrets_of_other_engines_from_an_engine_s_commands(
     assert {name for name, value in slurm_commands.environment().items() if value == "secret"} == {"SLURM_JWT"}
     found = {name for name, value in ray_environment("h:1").items() if value == "secret"}
     assert found == {"RAY_AUTH_TOKEN"}
+    monkeypatch.setenv("MUSTER_INHERIT", "HF_TOKEN")
+    assert ray_environment("h:1")["MUSTER_INHERIT"] == "HF_TOKEN", "its driver hands the names to the nodes"

@@ -35,6 +35,19 @@ def test_a_session_has_the_rights_of_its_key_as_they_are_now(keys: KeyStore) -> 
     assert here.session(session) is None, "another key of the same name"
 
 
+def test_work_for_somebody_has_the_rights_that_they_have_now(keys: KeyStore) -> None:
+    """Automatic evaluations ask so: whoever would not be admitted has no rights."""
+    names = ("MUSTER_TOKEN", "user ann", "address 10.0.0.1", "this process", "key a")
+    here, with_token = Access(keys), Access(keys, "a-token-of-the-server")
+    assert [here.actor_named(name) for name in names] == [*map(Actor, names[:4]), None], "no key was ever demanded"
+    keys.create("a", ("robots",), read_only=True)
+    key = Actor("key a", frozenset({"robots"}), True, "a")
+    assert [here.actor_named(name) for name in names] == [None, None, None, Actor("this process"), key]
+    assert with_token.actor_named("MUSTER_TOKEN") == Actor("MUSTER_TOKEN")
+    keys.delete("a")
+    assert [here.actor_named(name) for name in names] == [None, None, None, Actor("this process"), None]
+
+
 def test_a_changed_session_is_none(keys: KeyStore) -> None:
     keys.create("a")
     keys.create("b")

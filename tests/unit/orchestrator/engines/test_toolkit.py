@@ -41,14 +41,19 @@ def test_a_started_process_has_the_variables_that_programs_need_and_those_that_a
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     ours = dict.fromkeys(PRIVATE, "secret")
-    theirs = {"HOME": "/root", "LC_ALL": "C", "NCCL_DEBUG": "INFO"}
-    monkeypatch.setattr("os.environ", {**ours, **theirs, "HF_TOKEN": "hunter2", "KUBECONFIG": "/k", "PGHOST": "db"})
+    theirs = {"HOME": "/root", "LC_ALL": "C", "NCCL_DEBUG": "INFO", "AWS_CA_BUNDLE": "/ca", "PIP_CERT": "/ca"}
+    others = ("KUBECONFIG", "PGHOST", "NVIDIA_API_KEY", "CONDA_TOKEN", "RAY_REDIS_PASSWORD", "PIP_INDEX_URL")
+    others += ("PYTHON_KEYRING_PASSWORD", "MUSTER_MY_SECRETS", "HF_TOKEN")
+    monkeypatch.setattr("os.environ", {**ours, **theirs, **dict.fromkeys(others, "hunter2")})
     del os.environ["MUSTER_INHERIT"]
     assert inherited() == theirs
-    assert inherited(["HOME"], ("LC_",), kept=["RAY_AUTH_TOKEN"]) == {"NCCL_DEBUG": "INFO", "RAY_AUTH_TOKEN": "secret"}
-    assert inherited(["HOME"], ("LC_",), kept=["HOME"]) == {"HOME": "/root", "NCCL_DEBUG": "INFO"}
-    os.environ["MUSTER_INHERIT"] = "HF_TOKEN MUSTER_TOKEN NOSUCH"
-    assert inherited() == {**theirs, "HF_TOKEN": "hunter2"}, "and the controller's own never"
+    rest = {name: theirs[name] for name in ("NCCL_DEBUG", "AWS_CA_BUNDLE", "PIP_CERT")}
+    assert inherited(["HOME"], ("LC_",), kept=["RAY_AUTH_TOKEN"]) == {**rest, "RAY_AUTH_TOKEN": "secret"}
+    assert inherited(["HOME"], ("LC_",), kept=["HOME"]) == {**rest, "HOME": "/root"}
+    os.environ["MUSTER_INHERIT"] = "HF_TOKEN NVIDIA_API_KEY MUSTER_TOKEN SLURM_JWT NOSUCH"
+    named = {"HF_TOKEN": "hunter2", "NVIDIA_API_KEY": "hunter2"}
+    assert inherited() == {**theirs, **named}, "and the controller's own never"
+    assert inherited(named=["KUBECONFIG"]) == {**theirs, "KUBECONFIG": "hunter2"}
 
 
 def test_waiting_ends_when_the_condition_holds_or_the_time_is_over() -> None:

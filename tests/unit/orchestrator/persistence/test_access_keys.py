@@ -78,8 +78,29 @@ def test_a_key_has_the_letters_and_digits_of_its_name_as_its_share(
     keys: KeyStore, name: str, asked: str | None, share: str
 ) -> None:
     assert keys.create(name, share=asked).share == share
+    with pytest.raises(KeyUsageError, match=f"would have the share of key {name}: --share {share} shares it") as caught:
+        keys.create(share + "_")
+    assert "\n" not in str(caught.value)
+    assert keys.create(share + "_", share=share).share == share
     older = {"name": name, "accessKeyId": "MSTR234567ABCDEFGHIJ", "secret": "s" * 40, "createdAt": 1}
     assert asked or Key.model_validate(older).share == share
+
+
+def test_a_look_that_fails_as_none_should_is_not_the_last_one(
+    keys: KeyStore, others: KeyStore, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    keys.create("a")
+    monkeypatch.setattr(access_keys, "INTERVAL", 0.01)
+    keys.start()
+    with monkeypatch.context() as patch:
+        patch.setattr(keys, "_opened", lambda row: 1 / 0)
+        others.create("b")
+        wait_for(lambda: caplog.records, what="a look that fails")
+        assert names(keys) == ["a"]
+    others.delete("a")
+    wait_for(lambda: names(keys) == ["b"], what="the next look")
+    assert len(caplog.records) == 1 and "those that were read last stay in force" in caplog.text
+    keys.close()
 
 
 def test_while_the_database_can_not_be_read_the_keys_stay_and_a_damaged_one_is_refused_alone(
