@@ -30,9 +30,12 @@ from orchestrator.engines.toolkit.gpus import visible_gpus
 from orchestrator.home import local_url, muster_home
 from shared_store import __version__
 from shared_store.contract.error_text import counted
+from shared_store.contract.plugins import plugins
 from shared_store.process.cgroups import own_group
 from shared_store.process.memory_groups import limits_memory
-from shared_store.volume.files import write_json
+from shared_store.volume.files import DamagedFile, write_json
+from shared_store.volume.layout import Store
+from shared_store.volume.plugin_folders import orphans
 
 _WORKER = ("torch", "warp-lang", "newton", "rsl-rl-lib", "gymnasium")
 _LEAST_SHARED_MEMORY = 256
@@ -83,6 +86,7 @@ def _examine(engines: Sequence[str], store: Path, worker: bool) -> Iterator[Find
     yield Finding("GPUs", "ok" if gpus else "absent", ", ".join(gpus) or "none that NVIDIA's driver lists")
     yield _checked("home", lambda: _directory(muster_home()))
     yield _checked("store", lambda: _store(store))
+    yield from _plugins(store)
     yield _shared_memory()
     yield _memory_limit()
     yield _controller()
@@ -129,6 +133,19 @@ def _store(path: Path) -> str:
         took = time.perf_counter() - started
         json.loads((Path(scratch) / "commit").read_text())
     return f"{text}, a durable write takes {took * 1000:.1f} ms"
+
+
+def _plugins(store: Path) -> Iterator[Finding]:
+    """The plug-ins that are installed, or those that are not and have folders in the store."""
+    try:
+        absent = list(orphans(Store(store)))
+    except (DamagedFile, OSError) as error:
+        yield Finding("plug-ins", "bad", f"{error}; until then no run and no job is deleted")
+        return
+    for each in absent:
+        yield Finding("plug-ins", "absent", f"{each}; until then no run and no job is deleted")
+    if not absent:
+        yield Finding("plug-ins", "ok", ", ".join(plugins()) or "none is installed")
 
 
 def _shared_memory() -> Finding:

@@ -52,8 +52,8 @@ def gc(
         return
     if dry_run and gone:
         print_cut(_table(gone))
-    for each in kept:
-        echo(f"kept: run {each['run']}: {'; '.join(each['kept'])}")
+    for reasons, runs_kept in _by_reasons(kept).items():
+        echo(f"kept: {'run' if len(runs_kept) == 1 else 'runs'} {', '.join(runs_kept)}: {reasons}")
     jobs, runs = sum(len(each["jobs"]) for each in gone), sum(each["whole"] for each in gone)
     size = sum(each["bytes"] for each in gone)
     files = counted(sum(each["files"] for each in gone), "file")
@@ -74,6 +74,15 @@ def _parts(client: Client, dry_run: bool, older_than: str) -> Iterator[list[dict
         )
         yield part["runs"]
         place = part["next"]
+
+
+def _by_reasons(kept: list[dict[str, Any]]) -> dict[str, list[str]]:
+    """The runs that are kept for the same reasons, by these."""
+    found: dict[str, list[str]] = {}
+    for each in kept:
+        names = found.setdefault("; ".join(each["kept"]), [])
+        names += [each["run"]] if each["run"] not in names else []
+    return found
 
 
 def _table(found: list[dict[str, Any]]) -> Table:

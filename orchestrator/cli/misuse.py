@@ -10,7 +10,7 @@ import typer
 from typer.core import TyperGroup
 
 from orchestrator.domain.errors import UsageError
-from shared_store.contract.error_text import explain, nearest
+from shared_store.contract.error_text import OF_PLUGIN, explain, nearest
 
 Misuse: type[Exception] = typer.BadParameter.__mro__[2]
 """The parser's exception. Typer takes it from click or has its own, depending on the version."""
@@ -29,7 +29,8 @@ class CommandGroup(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if self.get_command(ctx, args[0]) is None:
             near = nearest(args[0], self.commands, _see(ctx.command_path))
-            raise UsageError(f"{args[0]}: there is no such command; {near}")
+            further = f" ({OF_PLUGIN})" if ctx.parent is None else ""  # a plug-in adds no command to a group
+            raise UsageError(f"{args[0]}: there is no such command; {near}{further}")
         return super().resolve_command(ctx, args)
 
 

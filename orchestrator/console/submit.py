@@ -31,7 +31,7 @@ from orchestrator.services.texts import with_texts
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.file import from_text
 from orchestrator.spec.model import Spec
-from shared_store.contract.error_text import nearest
+from shared_store.contract.error_text import unknown_task
 
 router, _stored = page_router(), page_router(stored=True)
 
@@ -227,7 +227,7 @@ def _groups(request: Request, task: str) -> list[FieldGroup]:
     actor = actor_of(request)
     actor.check(Operation.SUBMIT_JOB)
     if task not in tasks():
-        raise ClientError(f"no task is called {task[:100]!r}; {nearest(task, list(tasks()))}", 404)
+        raise ClientError(unknown_task(task, tasks()), 404)
     with controller_of(request).database.session() as session:
         return groups(task, queue_names(session, actor))
 

@@ -71,7 +71,13 @@ class StoredRuns:
                 needed, unreadable = references(self._store)
                 self.check()
                 found = _Found(
-                    References.of((RetentionReference(*each) for each in needed), unreadable), began, version
+                    References.of(
+                        (RetentionReference(*each) for each in needed),
+                        (each.why for each in unreadable if not each.whole),
+                        (each.why for each in unreadable if each.whole),
+                    ),
+                    began,
+                    version,
                 )
                 self._found = found
             return found.references

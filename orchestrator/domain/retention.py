@@ -67,28 +67,38 @@ class References:
     """By kind and name: what needs it."""
     unreadable: tuple[str, ...] = ()
     """What could not be read, and may need any run that has results."""
+    unknown: tuple[str, ...] = ()
+    """What could not be read, and may need any run and any job: folders of plug-ins."""
 
     @classmethod
-    def of(cls, references: Iterable[RetentionReference], unreadable: Iterable[str] = ()) -> References:
+    def of(
+        cls,
+        references: Iterable[RetentionReference],
+        unreadable: Iterable[str] = (),
+        unknown: Iterable[str] = (),
+    ) -> References:
         found: dict[tuple[str, str], list[str]] = {}
         for each in references:
             found.setdefault((each.kind, each.name), []).append(each.by)
-        return cls(found, tuple(unreadable))
+        return cls(found, tuple(unreadable), tuple(unknown))
 
     def to(self, kind: Literal["run", "job"], name: str) -> Sequence[str]:
-        """What needs it."""
-        return self.found.get((kind, name), ())
+        """What needs it, or may need everything."""
+        return [*self.found.get((kind, name), ()), *self.unknown]
 
     def unnamed(self) -> References:
         """The same for who may not see everything: that something needs a run, and not what."""
         hidden = ["something needs it, and a key with all queues sees what"]
-        unreadable = ["something in the store can't be read"] if self.unreadable else ()
-        return References(dict.fromkeys(self.found, hidden), tuple(unreadable))
+        damaged = ("something in the store can't be read",)
+        unknown = ("something in the store can't be read and may need it, and a key with all queues sees what",)
+        return References(
+            dict.fromkeys(self.found, hidden), damaged if self.unreadable else (), unknown if self.unknown else ()
+        )
 
     def __or__(self, other: References) -> References:
         keys = self.found.keys() | other.found.keys()
         found = {key: [*self.found.get(key, ()), *other.found.get(key, ())] for key in keys}
-        return References(found, (*self.unreadable, *other.unreadable))
+        return References(found, (*self.unreadable, *other.unreadable), (*self.unknown, *other.unknown))
 
 
 @dataclass(frozen=True)

@@ -49,7 +49,7 @@ from orchestrator.spec.values import (
     place_of,
 )
 from shared_store.contract import plugins
-from shared_store.contract.error_text import Refused, explain, kind_of, nearest, path_of, shown
+from shared_store.contract.error_text import OF_PLUGIN, Refused, explain, kind_of, nearest, path_of, shown
 from shared_store.volume.texts import beside
 
 KINDS = ("train", *plugins.evaluating(), "export", "record", "render", "command")
@@ -398,7 +398,8 @@ def _explain(problem: Any, path: tuple[str | int, ...]) -> str:
         if other := getattr(algorithm, "elsewhere", {}).get(str(path[-1])):
             return f"{path[-2]} has no such setting; {other}"
         hint = nearest(path[-1], valid, "valid here: " + ", ".join(valid))
-        return f"unknown key; {hint}"
+        is_section = len(path) == 1 and isinstance(problem["input"], dict)
+        return f"unknown key; {hint}" + (f" ({OF_PLUGIN})" if is_section else "")
     return explain(problem)
 
 

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import excerpt
-from shared_store.contract.error_text import nearest, shown
+from shared_store.contract.error_text import shown, unknown_task
 from shared_store.volume.layout import NAME
 
 _UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
@@ -80,8 +80,7 @@ def _task_name(value: str) -> str:
     known = known_tasks()
     if ":" in value or value in known:
         return value
-    hint = nearest(value, known)
-    raise ValueError(f"no task is called {shown(value)}; {hint} (your own: module:Class)")
+    raise ValueError(unknown_task(value, known))
 
 
 def _environment(value: dict[str, str]) -> dict[str, str]:

@@ -28,6 +28,9 @@ _EXPECTED = {
     "dataclass_exact_type": "expected a mapping",
 }
 
+OF_PLUGIN = "a plug-in's: install its package"
+"""What to do where a name is unknown that a plug-in may bring: a task, a command, a section of a job."""
+
 Path = tuple[str | int, ...]
 
 
@@ -94,6 +97,11 @@ def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: flo
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=cutoff)
     return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
+
+
+def unknown_task(name: str, known: Iterable[str]) -> str:
+    """That no task has this name, with the nearest of the known ones."""
+    return f"no task is called {shown(name)}; {nearest(name, known)} (your own: module:Class; {OF_PLUGIN})"
 
 
 def kind_of(value: object) -> str:

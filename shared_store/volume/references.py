@@ -25,25 +25,25 @@ class Needed(NamedTuple):
 
 
 class Unreadable(NamedTuple):
-    """What can't be read, and so may need any run; one clause that names it and says why."""
+    """What can't be read, and so may need any run that has results."""
 
     why: str
+    """One clause that names it and says why."""
+    whole: bool = False
+    """Whether it may need any run and any job; so is everything of a plug-in that can't be read."""
 
 
 Found = Iterator[Needed | Unreadable]
 
 
-def references(store: Store) -> tuple[list[Needed], list[str]]:
+def references(store: Store) -> tuple[list[Needed], list[Unreadable]]:
     """All that in the store needs a run or a job, and what could not be read."""
-    needed: list[Needed] = []
-    unreadable: list[str] = []
-    for what, referrer in _referrers():
-        for each in read(what, referrer, store):
-            if isinstance(each, Needed):
-                needed.append(each)
-            else:
-                unreadable.append(each.why)
-    return needed, unreadable
+    found = [each for what, referrer in _OWN for each in read(what, referrer, store)]
+    for what, referrer in _of_plugins():
+        of_plugin = read(what, referrer, store)
+        found += [each if isinstance(each, Needed) else each._replace(whole=True) for each in of_plugin]
+    needed = [each for each in found if isinstance(each, Needed)]
+    return needed, [each for each in found if isinstance(each, Unreadable)]
 
 
 def read(what: str, referrer: Callable[..., Found], *arguments: Any) -> Found:
@@ -88,13 +88,15 @@ def _of_run(name: str, path: Path) -> Found:
             yield from needed_run(teacher, f"it is the teacher of run {name}")
 
 
+_OWN = (("models", _of_models), ("runs", _of_runs))
+
+
 def _of_orphans(store: Store) -> Found:
-    """Folders of plug-ins that are not installed may need anything."""
-    yield from map(Unreadable, orphans(store))
+    yield from (Unreadable(str(each)) for each in orphans(store))
 
 
-def _referrers() -> Iterator[tuple[str, Callable[[Store], Found]]]:
-    yield from (("models", _of_models), ("runs", _of_runs), ("plugins.json", _of_orphans))
+def _of_plugins() -> Iterator[tuple[str, Callable[[Store], Found]]]:
+    yield "plugins.json", _of_orphans
     for name, plugin in plugins().items():
         if plugin.references:
             yield name, load(plugin.references)

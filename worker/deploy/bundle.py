@@ -33,17 +33,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from shared_store import __version__
-from shared_store.contract.plugins import load, plugins
 from shared_store.contract.policy import Contract
 from shared_store.volume.bundles import CONTRACT, REPORT, publish, seal
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.files import remove_tree, write_json
 from shared_store.volume.layout import Run
 from worker.deploy import parity, rollouts
+from worker.deploy.bundle_documents import bundle_documents
 from worker.deploy.leapp_description import LEAPP, leapp_description
 from worker.deploy.model_file import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
 from worker.deploy.robots import add_robot
-from worker.tasks.run.declared import DeclaredTask
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy, Policy
@@ -147,9 +146,11 @@ def export(
 
     Raises:
         TrainingError: A file computes something else than the policy, or does worse on the task's worlds; nothing is published then.
-        UserError: The policy has a memory that its ``module()`` does not have.
+        UserError: The policy has a memory that its ``module()`` does not have, or a document of the task or of a plug-in can't be in
+            a bundle.
     """
     policy, acting = policies
+    documents = bundle_documents(task, checkpoint.manifest["algorithm"])
     exported = policy.module()
     groups = {group.input: group.name for group in contract.groups}
     begin = task.state_dict()
@@ -168,11 +169,17 @@ def export(
             "runtime": f"onnxruntime {metadata.version('onnxruntime')}",
             **rollouts.judge(trained, played),
         }
-    return _publish(run, checkpoint, task, contract, files, {**report, "changed_robot": changes or None})
+    return _publish(run, checkpoint, task, contract, files, documents, {**report, "changed_robot": changes or None})
 
 
 def _publish(
-    run: Run, checkpoint: Checkpoint, task: Task, contract: Contract, files: Files, report: Mapping[str, Any]
+    run: Run,
+    checkpoint: Checkpoint,
+    task: Task,
+    contract: Contract,
+    files: Files,
+    documents: Mapping[str, Mapping[str, Any]],
+    report: Mapping[str, Any],
 ) -> Path:
     target = run.exports / checkpoint.name
     hidden = run.exports / f".{checkpoint.name}.{uuid.uuid4().hex[:8]}.tmp"
@@ -186,9 +193,6 @@ def _publish(
         write_json(hidden / REPORT, report)
         (hidden / LEAPP).write_text(leapp_description(files.onnx, contract))
         robot = add_robot(task, hidden)
-        documents = dict(task.bundle_documents(facts.get("algorithm", ""))) if isinstance(task, DeclaredTask) else {}
-        for place in (plugin.bundle_parts for plugin in plugins().values() if plugin.bundle_parts):
-            documents |= load(place)(task)
         for name, document in documents.items():
             write_json(hidden / name, document)
         (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot, list(documents)))
@@ -245,7 +249,7 @@ def _readme(
     else:
         package = f", of {robot['package']}" if "package" in robot else ""
         about = f"The robot's model is not in the bundle. Its source: `{robot['source']}`{package}; licence: {robot['licence']}."
-    further = "".join(f"- `{name}`: what the task says besides.\n" for name in documents)
+    further = "".join(f"- `{name}`: what the task or a plug-in says besides.\n" for name in documents)
     return f"""# Policy of task {contract.task}
 
 From run {run.name}, checkpoint {checkpoint.name}, iteration {checkpoint.iteration}. Made by Muster {__version__}.

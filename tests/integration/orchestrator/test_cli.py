@@ -369,6 +369,24 @@ def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:
         assert any(said in line for line in lines), said
 
 
+def test_folders_of_plug_ins_that_are_not_installed_are_named(tmp_path: Path) -> None:
+    store = tmp_path / "store"
+    (store / "cards").mkdir(parents=True)
+    (store / "plugins.json").write_text('{"absent": ["cards"]}')
+    found = json.loads(call_muster("doctor", "--json", home=tmp_path).stdout)
+    [finding] = [each for each in found if each["what"] == "plug-ins"]
+    assert finding["state"] == "absent"
+    for part in (
+        "plug-in 'absent' is not installed",
+        f"folder {store / 'cards'} needs",
+        "no run and no job is deleted",
+    ):
+        assert part in finding["text"]
+    (store / "plugins.json").write_text('{"absent": 3}')
+    done = call_muster("doctor", home=tmp_path)
+    assert done.returncode == 1 and "expected a list of names of folders" in done.stdout
+
+
 def test_a_resume_without_a_controller_makes_no_store(tmp_path: Path) -> None:
     missing = tmp_path / "stroe"
     done = call_muster("resume", "ant-1f2e3d4c", "--store", str(missing), home=tmp_path / "home")

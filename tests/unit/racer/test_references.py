@@ -27,7 +27,7 @@ def test_an_entry_that_can_t_be_read_is_named_since_it_may_need_any_run(store: S
     found, unreadable = references(store)
     assert found == []
     for part in ("entry 1 of league cup", "entry 2 of league cup"):
-        assert any(part in each for each in unreadable), (part, unreadable)
+        assert any(part in each.why and each.whole for each in unreadable), (part, unreadable)
 
 
 def test_a_league_that_can_t_be_read_hides_no_other(store: Store) -> None:
@@ -39,4 +39,4 @@ def test_a_league_that_can_t_be_read_hides_no_other(store: Store) -> None:
         found, unreadable = references(store)
     entries.chmod(0o755)
     assert {each.by for each in found} == {"entry 1 of league bowl cites it"}
-    assert any(each.startswith("league cup can't be read ([Errno 13]") for each in unreadable), unreadable
+    assert any(each.why.startswith("league cup can't be read ([Errno 13]") for each in unreadable), unreadable

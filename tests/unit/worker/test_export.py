@@ -326,7 +326,7 @@ def bundle_of(tmp_path: Path, kind: Any) -> tuple[Path, dict[str, Any]]:
     checkpoint: Any = SimpleNamespace(name="00000004-e1", iteration=4, manifest=manifest)
     run = Run(tmp_path / "run")
     run.path.mkdir()
-    target = _publish(run, checkpoint, task, SUMMED, files, {})
+    target = _publish(run, checkpoint, task, SUMMED, files, {}, {})
     return target, verify(target)
 
 

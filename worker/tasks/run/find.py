@@ -8,7 +8,7 @@ import sys
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING
 
-from shared_store.contract.error_text import nearest
+from shared_store.contract.error_text import nearest, unknown_task
 from worker.tasks.run.mistakes import task_mistakes
 
 if TYPE_CHECKING:
@@ -49,7 +49,7 @@ def find_task(name: str) -> type[Task]:
     known = task_names()
     where = name if ":" in name else known.get(name)
     if where is None:
-        raise ValueError(f"no task is called {name!r}; {nearest(name, known)} (your own: module:Class)")
+        raise ValueError(unknown_task(name, known))
     module_name, _, class_name = where.partition(":")
     if name == where and os.getcwd() not in sys.path:
         sys.path.append(

@@ -12,8 +12,8 @@ from orchestrator.cli.misuse import CommandGroup
 from tests.conftest import call_muster
 
 MISUSE = {
-    "evalute": "evalute: there is no such command; did you mean evaluate?",
-    "zzz": "zzz: there is no such command; see: muster --help",
+    "evalute": "evalute: there is no such command; did you mean evaluate? (a plug-in's: install its package)",
+    "zzz": "zzz: there is no such command; see: muster --help (a plug-in's: install its package)",
     "--verison": "--verison: there is no such option; did you mean --version? see: muster --help",
     "evaluate x --episods 5": (
         "--episods: there is no such option; did you mean --episodes? see: muster evaluate --help"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import shutil
 from collections.abc import Callable, Iterable
 from math import inf
@@ -30,12 +31,18 @@ from orchestrator.persistence.batch_models import (
 )
 from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
 from shared_store.volume import contents, trash
-from shared_store.volume.files import sync_directory
+from shared_store.volume.files import sync_directory, write_json
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.retention import LONG_AGO, World
 from tests.support.orchestrator.rows import job
 
 ARN = "arn:aws:batch:us-east-1:000000000000:job-definition/"
+
+
+def of_absent_plugin(store: Store) -> None:
+    """Leave a folder of a plug-in that is not installed."""
+    write_json(store.path / "plugins.json", {"absent": ["cards"]})
+    (store.path / "cards").mkdir()
 
 
 def test_a_pass_takes_old_jobs_of_the_batch_api_with_their_runs_and_nothing_else(world: World) -> None:
@@ -87,6 +94,7 @@ def test_results_keep_the_run_and_its_logs_go_with_the_job(world: World) -> None
         ),
         (lambda w: contents.archive(w.store.run("old"), "key a"), "archived"),
         (lambda w: (w.store.run("old").path / "metrics").symlink_to("/"), "can't be read"),
+        (lambda w: of_absent_plugin(w.store), "plug-in 'absent' is not installed, so what its folder .*/cards needs"),
     ],
 )
 def test_a_run_that_something_needs_is_kept_with_its_jobs(
@@ -95,12 +103,20 @@ def test_a_run_that_something_needs_is_kept_with_its_jobs(
     world.ended("old")
     make(world)
     before = world.rows()
-    assert reason in world.reasons()["old"]
+    assert re.search(reason, world.reasons()["old"])
     world.retention().take_all()
     assert world.rows() == before and (world.store.run("old").path / "logs" / "old").is_dir()
     with pytest.raises(RunNeeded, match=reason):
         world.retention().delete("old")
     assert (world.store.run("old").path / "logs" / "old").is_dir()
+
+
+def test_a_job_whose_run_is_gone_is_kept_while_a_plug_in_is_absent(world: World) -> None:
+    world.ended("old", directory=False)
+    of_absent_plugin(world.store)
+    assert world.retention().take_all().jobs == 0 and world.jobs() == ["old"]
+    (world.store.path / "cards").rmdir()
+    assert world.retention().take_all().jobs == 1 and world.jobs() == []
 
 
 def test_a_job_that_uses_a_run_is_one_of_its_open_jobs(world: World) -> None:

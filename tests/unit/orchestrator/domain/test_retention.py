@@ -45,6 +45,8 @@ def test_an_old_run_that_holds_nothing_but_logs_goes_with_its_job() -> None:
         ({}, [], References.of([RetentionReference("run", "r", "model a@1 is of it")]), "model a@1 is of it"),
         ({}, [], References.of([RetentionReference("job", "old", "job w waits for it")]), "job w waits for it"),
         ({"results": ("checkpoints",)}, [], References.of([], ["model b@2 can't be read"]), "model b@2 can't be read"),
+        ({}, [], References.of([], [], ["plug-in x is not installed"]), "plug-in x is not installed"),
+        ({"results": ("checkpoints",)}, [], References.of([], [], ["plug-in x is not"]), "plug-in x is not"),
     ],
 )
 def test_nothing_of_a_run_goes_while_something_needs_it(
@@ -55,6 +57,15 @@ def test_nothing_of_a_run_goes_while_something_needs_it(
     assert (decision.run, decision.jobs) == (False, ())
     assert reason in " ".join(decision.reasons)
     assert list(decision.reasons) == still_needed(run, [OLD, *jobs], references)
+
+
+def test_a_plug_in_that_can_t_be_asked_keeps_every_run_and_every_job_for_one_reason() -> None:
+    unknown = References.of([], [], ["plug-in x is not installed"])
+    assert still_needed(RUN, [OLD, JobFacts("young")], unknown) == ["plug-in x is not installed"]
+    assert decide(None, [OLD, JobFacts("other", is_due=True)], unknown) == Decision(
+        False, (), ("plug-in x is not installed",)
+    )
+    assert (unknown | NOTHING).unknown == (NOTHING | unknown).unknown == unknown.unknown
 
 
 @pytest.mark.parametrize(
@@ -77,8 +88,13 @@ def test_who_may_not_see_everything_is_not_told_what_needs_a_run() -> None:
     references = References.of(
         [RetentionReference("run", "r", "run secret is a clone of it")], ["model hidden can't be read"]
     )
-    for run in (RUN, RunFacts("r2", results=("checkpoints",))):
-        [reason] = still_needed(run, [OLD], references.unnamed())
+    unknown = References.of([], [], ["league hidden can't be read"])
+    for run, needed in (
+        (RUN, references),
+        (RunFacts("r2", results=("checkpoints",)), references),
+        (RUN, unknown),
+    ):
+        [reason] = still_needed(run, [OLD], needed.unnamed())
         assert "something" in reason and "secret" not in reason and "hidden" not in reason
 
 

@@ -19,6 +19,7 @@ from orchestrator.spec.compile import compile_definition, compile_submission
 from orchestrator.spec.file import load, read
 from orchestrator.spec.model import KINDS, Spec, validate
 from orchestrator.spec.values import known_tasks
+from shared_store.contract.error_text import OF_PLUGIN
 from tests.support.refusals import refusal
 from worker.settings.ppo import PPOConfig
 from worker.tasks.run.find import BUILT_IN
@@ -101,6 +102,8 @@ FILES: dict[str, str] = {
     **{ppo(settings): f":6: train.ppo.{said}" for settings, said in PPO.items()},
     f"name: a\n{TRAIN}\nnodez: 2\n": ":3: nodez: unknown key; did you mean nodes?",
     f"name: a\n{TRAIN}\nxyzzyq: 2\n": f":3: xyzzyq: unknown key; valid here: {TOP}",
+    f"name: a\n{TRAIN}\nrally: {{run: x}}\n": f":3: rally: unknown key; valid here: {TOP} ({OF_PLUGIN})",
+    f"name: a\n{TRAIN}\nnodez: {{run: x}}\n": f":3: nodez: unknown key; did you mean nodes? ({OF_PLUGIN})",
     "nme: a\ncommand: [x]\n": ":1: nme: unknown key; did you mean name? (and 1 more)",
     f"name: a\n{TRAIN}\nnodez: 2\nretyr: 2\n": ":3: nodez: unknown key; did you mean nodes? (and 1 more)",
     "name: a\ntrain:\n  task: Cartpole\n  worlds: 4\n  iteration: 2\n": (
@@ -130,10 +133,10 @@ FILES: dict[str, str] = {
     "name: a\ncommand: [x]\nenvironment:\n  A: 1\n": ":4: environment.A: expected a text, found a whole number (1)",
     "name: a\ntrain: Cartpole\n": ":2: train: expected a mapping, found a text ('Cartpole')",
     "name: a\ntrain: {task: Cartpoel, worlds: 4, iterations: 2}\n": (
-        ":2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class)"
+        f":2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class; {OF_PLUGIN})"
     ),
     "name: a\ntrain: {task: zzz, worlds: 4, iterations: 2}\n": (
-        f":2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class)"
+        f":2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class; {OF_PLUGIN})"
     ),
     "name: a\nevaluate: {run: ../x}\n": f":2: evaluate.run: {RUN_LETTERS}, found '../x'",
     "name: a\nexport: {run: x, checkpoint: new}\n": (

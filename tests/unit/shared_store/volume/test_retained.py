@@ -192,7 +192,7 @@ def test_what_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> 
     found, unreadable = references(store)
     assert found == []
     for part in ("run source", "model ant@1", "model bee@1"):
-        assert any(part in each for each in unreadable), (part, unreadable)
+        assert any(part in each.why for each in unreadable), (part, unreadable)
 
 
 def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
@@ -214,9 +214,32 @@ def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
     with permissions_count():
         found, unreadable = references(store)
         (store.path / "models").chmod(0)
-        assert any(each.startswith("models can't be read") for each in references(store)[1])
+        assert any(each.why.startswith("models can't be read") for each in references(store)[1])
     for path in (*closed, store.models):
         path.chmod(0o755)
     assert {each.by for each in found} == {"run child is a clone of it", "model bee@1 is of it"}
     for part in ("model ant", "run hidden", "run pupil"):
-        assert any(each.startswith(f"{part} can't be read ([Errno 13]") for each in unreadable), (part, unreadable)
+        assert any(each.why.startswith(f"{part} can't be read ([Errno 13]") for each in unreadable), (part, unreadable)
+
+
+def noted(store: Store, folders: object) -> None:
+    write_json(store.path / "plugins.json", {"absent": folders})
+
+
+def test_folders_of_a_plug_in_that_is_not_installed_may_need_any_run_and_any_job(store: Store) -> None:
+    noted(store, ["cards", "decks"])
+    assert references(store) == ([], []), "there are none"
+    (store.path / "cards").mkdir()
+    words = f"what its folder {store.path / 'cards'} needs can't be known; install the package that brings it, or move the folder out"
+    [unreadable] = references(store)[1]
+    assert unreadable.whole and unreadable.why == f"plug-in 'absent' is not installed, so {words} of the store"
+    write(store.path / "decks" / "1.json")
+    [unreadable] = references(store)[1]
+    assert f"its folders {store.path / 'cards'} and {store.path / 'decks'} need" in unreadable.why
+
+
+@pytest.mark.parametrize("folders", [3, [3], "cards", {"cards": 1}, None, ["../x"], ["/"], [""]])
+def test_a_note_of_folders_that_is_not_one_may_need_any_run_and_any_job(store: Store, folders: object) -> None:
+    noted(store, folders)
+    [unreadable] = references(store)[1]
+    assert unreadable.whole and "plugins.json: 'absent': expected a list of names of folders" in unreadable.why
