@@ -13,7 +13,8 @@ from sqlalchemy.orm import Session
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import excerpt
-from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec, gang_needs
+from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec
+from orchestrator.domain.gang_checks import checked_gang
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.services import definitions, submission
@@ -83,13 +84,15 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
         context,
         spec,
         named_queue(context.session, context.actor, spec.queue),
-        gang_needs(definition["nodeProperties"]),
+        checked_gang(definition["nodeProperties"]),
         what,
     )
     return definition
 
 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
+    if "\0" in directory:
+        raise ClientError("directory: a zero byte is not possible; give the path of a directory")
     definition = compile_definition(spec, directory)
     context.actor.check(Operation.SUBMIT_JOB, JobsOf(named_queue(context.session, context.actor, spec.queue).name))
     check_training(context.controller.access.store, spec.document(), context.read)
@@ -149,7 +152,7 @@ def submit(
     queue = named_queue(context.session, context.actor, spec.queue)
     share = submission.open_queue(context, queue, spec.share)
     properties = with_environment(document["nodeProperties"], environment or {})
-    gang = gang_needs(properties)
+    gang = checked_gang(properties)
     definition = definitions.revision(context, spec.name, document, gang, again=False)
     context.actor.check(Operation.SUBMIT_JOB, definition)
     _check_fit(context, spec, queue, gang, what)

@@ -16,6 +16,7 @@ from orchestrator.control.compute_environments import queue_engines
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.gang_checks import CheckedGang
 from orchestrator.domain.identifiers import SHARE
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
@@ -78,7 +79,7 @@ class Submission:
     queue: JobQueue
     definition: JobDefinition
     properties: Mapping[str, Any]
-    gang: GangSpec
+    gang: CheckedGang
     record: Mapping[str, Any]
     share: str | None = None
     priority: int = 0
