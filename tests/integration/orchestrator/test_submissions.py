@@ -154,9 +154,7 @@ def test_the_largest_environment_is_taken_and_shown(server: Server) -> None:
 def test_a_job_that_continues_a_run_is_checked_by_the_same_rules(
     server: Server, path: str, change: dict[str, Any], words: str
 ) -> None:
-    if not server.store.run("trained").path.exists():
-        add_run(server.store, "trained", TRAINED)
-        add_checkpoint(server.store, "trained", 5)
+    trained(server)
     before = rows(server)
     refused = message(sent(server, f"/api/runs/trained/{path}", change))
     assert re.search(words, refused), refused
@@ -177,3 +175,54 @@ def test_a_row_that_an_earlier_muster_has_stored_is_named_and_is_no_internal_err
     assert httpx.get(f"{server.url}/api/jobs").status_code == 200
     described = httpx.post(f"{server.url}/v1/describejobs", json={"jobs": [job]})
     assert described.status_code in (200, 409), described.text
+
+
+def trained(server: Server) -> None:
+    """The run ``trained``, with a checkpoint, in the store."""
+    if not server.store.run("trained").path.exists():
+        add_run(server.store, "trained", TRAINED)
+        add_checkpoint(server.store, "trained", 5)
+
+
+OTHERS: dict[str, tuple[str, dict[str, Any]]] = {
+    "another command": ("/api/jobs", {"spec": {**SPEC, "command": ["false"]}}),
+    "another name": ("/api/jobs", {"spec": {**SPEC, "name": "other"}}),
+    "another directory": ("/api/jobs", {"spec": SPEC, "directory": "/elsewhere"}),
+    "another environment": ("/api/jobs", {"spec": SPEC, "environment": {"A": "b"}}),
+    "SubmitJob": ("/v1/submitjob", {"jobName": "say", "jobQueue": "default", "jobDefinition": "say"}),
+    "a resumed run": ("/api/runs/trained/resume", {}),
+    "a clone": ("/api/runs/trained/clone", {"name": "of-trained"}),
+}
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_an_idempotency_key_answers_its_own_request_alone(server: Server, case: str) -> None:
+    trained(server)
+    key, (path, body) = f"key-of-{case.replace(' ', '-')}", OTHERS[case]
+    first = sent(server, "/api/jobs", {"spec": SPEC}, key).json()
+    before = rows(server)
+    assert sent(server, "/api/jobs", {"spec": SPEC}, key).json() == first
+    other = sent(server, path, body, key)
+    assert other.status_code == 409, other.text
+    assert other.json()["message"] == f"idempotency key {key} was used for another request (job {first['jobId']})"
+    assert rows(server) == before
+
+
+def test_a_key_of_aws_s_api_answers_no_native_request(server: Server) -> None:
+    sent(server, "/api/jobs", {"spec": SPEC})
+    body = {"jobName": "say", "jobQueue": "default", "jobDefinition": "say"}
+    job = sent(server, "/v1/submitjob", body, "of-aws").json()["jobId"]
+    assert sent(server, "/v1/submitjob", body, "of-aws").json()["jobId"] == job
+    assert sent(server, "/api/jobs", {"spec": SPEC}, "of-aws").status_code == 409
+
+
+def test_a_resumed_run_and_a_clone_answer_the_same_request_alone(server: Server) -> None:
+    trained(server)
+    for path, body in (("resume", {}), ("clone", {"name": "cloned-once"})):
+        first = sent(server, f"/api/runs/trained/{path}", body, f"once-{path}")
+        assert first.status_code == 200, first.text
+        again = sent(server, f"/api/runs/trained/{path}", body, f"once-{path}")
+        assert again.json()["jobId"] == first.json()["jobId"]
+        changed = sent(server, f"/api/runs/trained/{path}", {**body, "set": ["train.iterations=8"]}, f"once-{path}")
+        assert changed.status_code == 409 and "was used for another request" in changed.json()["message"]
+        sent(server, "/v1/terminatejob", {"jobId": first.json()["jobId"], "reason": "seen"})
