@@ -262,6 +262,7 @@ class Job(Base):
 
 _alone = Job.parent.is_(None)
 Index("ix_jobs_named", Job.name, Job.created_at, sqlite_where=_alone, postgresql_where=_alone)
+Index("ix_jobs_owned", Job.name, Job.owner, Job.created_at, sqlite_where=_alone, postgresql_where=_alone)
 
 
 class RunRecord(Base):

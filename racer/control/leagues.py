@@ -360,10 +360,9 @@ def _identity(model: Model) -> dict[str, Any]:
 def _race_of(controller: Controller, actor: Actor, league: League, reference: str) -> tuple[str, str]:
     """Id and run of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
     with controller.database.session() as session:
-        queues = actor.queues
-        job = find_job(session, reference, queues)
+        job = find_job(session, reference, actor.queues, actor.name)
         if job is None:
-            raise ClientError(unknown_job(session, reference, queues), 404)
+            raise ClientError(unknown_job(session, reference, actor.queues, actor.name), 404)
         actor.check(operations.ENTER_LEAGUE, job)
         if job.status != Status.SUCCEEDED:
             raise ClientError(

@@ -96,7 +96,9 @@ def test_a_job_has_the_share_of_its_key_and_may_name_no_other(lab: Lab) -> None:
     assert lab.submit("ann-1", queue="default") is None, "a queue without a policy knows no shares"
     with pytest.raises(ApiError, match="can onlybe submitted to job queue with fair share"):
         lab.submit("ann-1", queue="default", shareIdentifier="ann1")
-    with pytest.raises(ApiError, match=r"^job queue default has no fair-share policy, so its jobs have no share; leave"):
+    with pytest.raises(
+        ApiError, match=r"^job queue default has no fair-share policy, so its jobs have no share; leave"
+    ):
         lab.spec("ann-1", queue="default", share="ann1")
     with pytest.raises(ApiError, match="evaluation: share 'other'"):
         lab.spec(
