@@ -33,9 +33,10 @@ from orchestrator.persistence.batch_models import Attempt, Job, JobDefinition, J
 from orchestrator.persistence.session import Database
 from orchestrator.server import Server
 from orchestrator.services.arns import definition_arn
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.file import load
 from tests.support.console.fixtures import secret_of
+from tests.support.definitions import submission_of
 from tests.support.keys import HomeKeys
 
 REQUESTS = 300
@@ -50,7 +51,7 @@ def fill(home: Path, count: int) -> None:
     """The database of a home directory, with so many jobs."""
     spec = load("job_specs/cartpole.yaml", [])
     definition = compile_definition(spec, str(home))
-    request, properties = compile_submission(spec, DEFINITION, None), definition["nodeProperties"]
+    request, properties = submission_of(spec, DEFINITION), definition["nodeProperties"]
     database = Database.at(home)
     with database.session() as session:
         session.add(JobDefinition(name="bench", revision=1, document=definition))

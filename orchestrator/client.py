@@ -19,7 +19,6 @@ from urllib.parse import quote, urlsplit
 import httpx
 
 from orchestrator.domain.errors import ApiError, NotServing, NoUrl, Unreachable
-from orchestrator.domain.identifiers import ACCESS_KEY_ID
 from orchestrator.domain.job import TERMINAL
 from orchestrator.home import local_controller, muster_home
 from shared_store.volume.texts import digest_of
@@ -61,8 +60,6 @@ class Client:
         if not _is_url(url):
             raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {EXAMPLE_URL}")
         self.url = url
-        self.has_key = bool(re.match(f"{ACCESS_KEY_ID}:", token or ""))
-        """Whether it sends a key, whose share its jobs have in a queue with a fair-share policy."""
         self.found = False
         """Whether it is the running controller of the home directory, which no URL named."""
         self.is_temporary = False

@@ -145,7 +145,7 @@ def _spec(
 ) -> Spec:
     """The job, on nodes like the training's. Raises SpecError, and ApiError for an unknown run."""
     trained = client.get(f"/api/runs/{run}")["spec"] or {}
-    document = evaluation_document(run, {**trained, **({"share": None} if client.has_key else {})}, section, name, kind)
+    document = evaluation_document(run, trained, section, name, kind)
     worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
     source = f"{'evaluation' if kind == 'evaluate' else kind} of {run}"
     changed = override(document, [*worlds, *elsewhere])

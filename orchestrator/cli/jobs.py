@@ -41,7 +41,7 @@ SpecArgument = Annotated[str, typer.Argument(help="A job YAML, such as job_specs
 JobArgument = Annotated[
     str,
     typer.Argument(
-        help="Job id or its first letters (4 or more), or a job name (its newest job); with :INDEX, an array's child."
+        help="Job id or its first letters (4 or more), or a job name (your newest of it, else the newest); with :INDEX, an array's child."
     ),
 ]
 
@@ -220,8 +220,9 @@ def stop(
     """
     with Client.connect() as client:
         detail = client.get(f"/api/jobs/{named(job)}")
+        which = _titled(detail)
         if detail["status"] in TERMINAL:
-            echo(f"{reasons.named(detail['name'], detail['id'])} is {detail['status']} already{next_step(detail)}")
+            echo(f"{which} is {detail['status']} already{next_step(detail)}")
             return
         client.batch("TerminateJob", jobId=detail["id"], reason=reason)
         said, patience = detail["statusReason"], time.monotonic() + _PATIENCE
@@ -231,18 +232,32 @@ def stop(
             detail = client.get(f"/api/jobs/{detail['id']}")
             if detail["statusReason"] != said and time.monotonic() > patience:
                 said = detail["statusReason"]
-                echo(f"{reasons.named(detail['name'], detail['id'])}: {one_line(said)}", err=True)
+                echo(f"{which}: {one_line(said)}", err=True)
             if slow and time.monotonic() > patience:
                 echo(slow, err=True)
                 slow = ""
     if not wait:
-        echo(f"{reasons.named(detail['name'], detail['id'])} is asked to stop")
+        echo(f"{which} is asked to stop")
         return
-    echo(f"{reasons.named(detail['name'], detail['id'])} ended: {one_line(detail['statusReason'])}")
+    echo(f"{which} ended: {one_line(detail['statusReason'])}")
     if lost := lost_iterations(detail):
         echo(lost)
     if _can_go_on(detail):
         echo(f"continue with: muster resume {detail['run']}")
+
+
+def owner_of(job: Mapping[str, Any]) -> str:
+    """The owner of a job where there are several people: a key without the word, another user; empty otherwise."""
+    owner: str = job["owner"] or ""
+    if owner.startswith("key "):
+        return owner.removeprefix("key ")
+    return owner if owner.startswith(("user ", "MUSTER_TOKEN")) and not job.get("isOwn", True) else ""
+
+
+def _titled(detail: Mapping[str, Any]) -> str:
+    """A job's name and id, and its owner where that is another."""
+    owner = "" if detail["isOwn"] else owner_of(detail)
+    return reasons.named(detail["name"], detail["id"]) + (f" of {owner}" if owner else "")
 
 
 def _can_go_on(detail: Mapping[str, Any]) -> bool:

@@ -8,7 +8,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.jobs import JsonOption, owner_of
 from orchestrator.cli.show import COLOURS, took, when
 from orchestrator.cli.terminal import echo, echo_json, one_line, print_cut
 from orchestrator.client import Client
@@ -70,7 +70,8 @@ def _newest(client: Client, queue: str | None, all_: bool, automatic: bool) -> l
 
 def _table(jobs: list[dict[str, Any]]) -> Table:
     table = Table(box=None, pad_edge=False)
-    for column in ("JOB", "NAME", "STATUS", "NODES", "CREATED", "TOOK"):
+    owners = ("OWNER",) if any(map(owner_of, jobs)) else ()
+    for column in ("JOB", "NAME", *owners, "STATUS", "NODES", "CREATED", "TOOK"):
         table.add_column(column, no_wrap=True)
     table.add_column("REASON", no_wrap=True, overflow="ellipsis")
     for job in jobs:
@@ -79,7 +80,8 @@ def _table(jobs: list[dict[str, Any]]) -> Table:
         reason = job["statusReason"] or "" if job["status"] != "SUCCEEDED" else ""
         nodes = f"1 × {job['arraySize']}" if job["arraySize"] else str(job["nodes"])
         table.add_row(
-            *(job["id"][:8], job["name"], f"[{colour}]{job['status']}[/]", nodes),
+            *(job["id"][:8], job["name"], *((job["owner"] or "").removeprefix("key ") for _ in owners)),
+            *(f"[{colour}]{job['status']}[/]", nodes),
             *(when(job["createdAt"]), took(job["ranSeconds"])),
             # a compiler's message has several lines, and brackets that are not markup
             escape(one_line("; ".join(filter(None, (evaluates, reason))))),

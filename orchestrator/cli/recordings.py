@@ -88,7 +88,7 @@ def record(
             worlds=worlds,
             episodes=episodes,
         )
-        _fetch(client, run, Spec(**_common(client, run, "record"), record=section), output)
+        _fetch(client, run, Spec(**_common(run, "record"), record=section), output)
 
 
 def render(
@@ -122,7 +122,7 @@ def render(
             section = Render.model_validate({**values, "format": output.suffix[1:]})
         except ValueError:
             raise UsageError(f"--size {size}: each side is from 64 to 4096 pixels, and even for an .mp4") from None
-        _fetch(client, run, Spec(**_common(client, run, "render"), render=section), output)
+        _fetch(client, run, Spec(**_common(run, "render"), render=section), output)
 
 
 def refuse_existing(path: Path, overwrite: bool) -> None:
@@ -177,11 +177,10 @@ def checkpoint_of(client: Client, run: dict[str, Any], source: str) -> int:
     return iteration
 
 
-def _common(client: Client, run: dict[str, Any], kind: str) -> dict[str, Any]:
-    """The parts of a job's spec that come from the training: queue, share (that of the key, if there is one), image, environment."""
+def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
+    """The parts of a job's spec that come from the training: queue, image, environment."""
     spec = run.get("spec") or {}
-    keys = ("queue", "image", "environment", *(() if client.has_key else ("share",)))
-    kept = {key: spec[key] for key in keys if spec.get(key)}
+    kept = {key: spec[key] for key in ("queue", "image", "environment") if spec.get(key)}
     memory = (spec.get("resources") or {}).get("memory", 2048)
     cpus = min(1.0, (spec.get("resources") or {}).get("cpus", 1.0))
     resources = Resources(cpus=cpus, memory=max(memory, 2048))

@@ -8,7 +8,7 @@ from typing import Any
 
 import typer
 
-from orchestrator.cli.jobs import JobArgument, JsonOption
+from orchestrator.cli.jobs import JobArgument, JsonOption, owner_of
 from orchestrator.cli.progress import best_told, shown_metrics
 from orchestrator.cli.terminal import Console, echo_json, one_line
 from orchestrator.client import Client, named
@@ -84,6 +84,7 @@ def show(job: JobArgument, as_json: JsonOption = False) -> None:
         "why": "" if detail["status"] == "SUCCEEDED" else one_line(detail["statusReason"] or ""),
         "in AWS's API": "" if detail["status"] == "SUCCEEDED" else one_line(detail["awsCode"] or ""),
         "phase": phase.words if (phase := phase_in(detail)) else "",
+        "owner": owner_of(detail),
         "created": when(detail["createdAt"]),
         "took": took(detail["ranSeconds"]),
         "queue": detail["queue"] + (f", share {detail['share']}" if detail["share"] else ""),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import secrets
 from collections.abc import Sequence
 from functools import partial
-from math import inf
 from typing import Any
 
 from fastapi import Depends, Query, Request, Response
@@ -16,7 +15,6 @@ from orchestrator.api.native import plan_routes, routes
 from orchestrator.api.native.plan_routes import PlanRequest
 from orchestrator.api.turns import Turns
 from orchestrator.console.forms import TOKEN, Form, done, sent_form
-from orchestrator.console.live import Recent
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import FieldGroup, document, filled, form_of, forms, groups, tasks, written
@@ -47,8 +45,6 @@ train:
 """
 _LARGEST = 192 << 10
 """Bytes of a form's YAML: of a file's text of at most 140,000 characters, with its indentation, and of the rest of the job."""
-_sent = Recent(inf, 1000)
-"""Id and name of the jobs of the last forms, by sender and the form's random name: a form that is sent again makes no second job."""
 _turns = Turns("the files of other jobs are being tried")
 """Each is tried in a process of its own."""
 _checks = Turns("other jobs are being checked")
@@ -153,27 +149,14 @@ def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Submit the job of a YAML, as ``muster submit`` does; a form that is sent again leads to the job that it made."""
     actor = actor_of(request)
     actor.check(Operation.SUBMIT_JOB)
-    sender, once, is_new = actor.name, form.one("once"), False
-
-    def make() -> tuple[str, str]:
-        nonlocal is_new
-        is_new = True
-        return _submitted(request, form)
-
-    job, name = _sent.get((sender, once), make) if once else make()
-    told = "submitted" if is_new else "this form has already submitted"
-    return done(request, f"/jobs/{job}", f"{told} {name} as {job[:8]}")
-
-
-def _submitted(request: Request, form: Form) -> tuple[str, str]:
-    """Submit the job of a form; its id and its name."""
     text = _lines(form.one("yaml"))
     spec, problem = _checked(request, text, whole=True)
     if spec is None:
         assert problem is not None
         raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
-    job = submit_spec(controller_of(request), actor_of(request), spec, "")
-    return job.id, job.name
+    job, is_new = submit_spec(controller_of(request), actor, spec, "", idempotency_key=form.one("once") or None)
+    beginning = "submitted" if is_new else "this form has already submitted"
+    return done(request, f"/jobs/{job.id}", f"{beginning} {job.name} as {job.id[:8]}")
 
 
 def _unfit(request: Request, spec: Spec, body: PlanRequest) -> SubmissionProblem | None:

@@ -16,6 +16,8 @@ MOST_NODES = 5000
 """Nodes of a gang from YAML; the Batch API takes AWS's 1,000."""
 LARGEST_DEFINITION = 24 << 10
 """Bytes of a job definition, as on AWS."""
+DEEPEST_SPEC = 100
+"""Levels of lists and mappings in a spec. A deeper one could be stored, but no answer could show it."""
 
 
 @dataclass(frozen=True)
@@ -103,10 +105,24 @@ class NodeSpec:
     def spec(self) -> Mapping[str, Any] | None:
         """The job YAML that the node reads; None where there is none. Raises ValueError."""
         text = self.environment.get("MUSTER_SPEC")
-        spec = json.loads(text) if text else None
-        if spec is not None and not isinstance(spec, dict):
-            raise ValueError("MUSTER_SPEC is not a mapping")
+        if not text:
+            return None
+        try:
+            spec = json.loads(text)
+            if "\\u" in text:  # JSON can say half of a character, which no answer could repeat
+                json.dumps(spec, ensure_ascii=False).encode()
+            is_too_deep = text.count("[") + text.count("{") > DEEPEST_SPEC and _depth(spec) > DEEPEST_SPEC
+        except (ValueError, RecursionError) as error:
+            raise ValueError(f"MUSTER_SPEC can't be read: {error}") from None
+        if (spec is not None and not isinstance(spec, dict)) or is_too_deep:
+            raise ValueError(f"MUSTER_SPEC is not a mapping of at most {DEEPEST_SPEC} levels")
         return spec
+
+
+def _depth(value: object) -> int:
+    """Number of levels of nested lists and mappings. Raises RecursionError."""
+    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    return 1 + max(map(_depth, inner), default=0)
 
 
 @dataclass(frozen=True)
@@ -170,7 +186,12 @@ def gang_needs(node_properties: Mapping[str, Any]) -> GangSpec:
     main = int(node_properties["mainNode"])
     whole = tuple(each for each in nodes if each is not None)
     variables = whole[main].environment
-    minimum = int(variables.get("MUSTER_MIN_NODES", count))
+    try:
+        minimum = int(variables.get("MUSTER_MIN_NODES", count))
+    except ValueError:
+        raise ValueError(
+            f"MUSTER_MIN_NODES is {variables['MUSTER_MIN_NODES'][:20]!r}; expected a whole number of nodes"
+        ) from None
     least = min(max(minimum, main + 1), count)  # never without the main node
     return GangSpec(main, whole, least, NativeOptions.read(variables))
 

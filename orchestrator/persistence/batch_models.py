@@ -161,7 +161,7 @@ class Job(Base):
     kind: Mapped[str] = mapped_column(default="multinode")
     """``multinode``, ``container`` (one node) or ``array`` (the parent of its children, with no process of its own)."""
     request: Mapped[dict[str, Any]]
-    """SubmitJob as it came; empty for an array's child."""
+    """SubmitJob as it came; of a request of the native API its digest; empty for an array's child."""
     own_node_properties: Mapped[dict[str, Any] | None] = mapped_column("node_properties", _JSON_OR_NULL)
     node_properties = _OfArray[dict[str, Any]]("own_node_properties")
     """Of the definition, with overrides and parameters applied; a ``container`` job is a gang of one node here."""
@@ -262,6 +262,7 @@ class Job(Base):
 
 _alone = Job.parent.is_(None)
 Index("ix_jobs_named", Job.name, Job.created_at, sqlite_where=_alone, postgresql_where=_alone)
+Index("ix_jobs_owned", Job.name, Job.owner, Job.created_at, sqlite_where=_alone, postgresql_where=_alone)
 
 
 class RunRecord(Base):

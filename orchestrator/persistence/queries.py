@@ -60,10 +60,12 @@ def states_of(session: Session, ids: Collection[str]) -> dict[str, tuple[Status,
     return {job: (Status(status), attempt, nodes) for job, status, attempt, nodes in session.execute(query)}
 
 
-def unknown_job(session: Session, reference: str, queues: Collection[str] | None = None) -> str:
+def unknown_job(
+    session: Session, reference: str, queues: Collection[str] | None = None, owner: str | None = None
+) -> str:
     """What to say where :func:`find_job`, with the same arguments, finds none."""
     array, _, index = reference.rpartition(":")
-    parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None
+    parent = find_job(session, array, queues, owner) if index.isdecimal() and ":" not in array else None
     if parent is None:
         return f"job {reference} does not exist; `muster list` shows the jobs"
     job = f"job {named(parent.name, parent.id)}"
@@ -72,27 +74,35 @@ def unknown_job(session: Session, reference: str, queues: Collection[str] | None
     return f"job {reference} does not exist: the children of {job} are 0 to {(parent.array_size or 1) - 1}"
 
 
-def find_job(session: Session, reference: str, queues: Collection[str] | None = None) -> Job | None:
+def find_job(
+    session: Session, reference: str, queues: Collection[str] | None = None, owner: str | None = None
+) -> Job | None:
     """The job with this id, else the newest one with this name, else the one whose id starts so.
 
     ``REFERENCE:3`` is the child with index 3 of the array that REFERENCE names.
 
-    ``queues``: only jobs of these are found; None: all jobs.
-    Raises RequestError where several ids start so.
+    Args:
+        session: Of the database.
+        reference: Id, beginning of an id, or name.
+        queues: Only jobs of these are found; None: all jobs.
+        owner: Whose jobs of a name come before those of others.
+
+    Raises:
+        RequestError: Several ids start so.
     """
     job = session.get(Job, reference)
     if job:
         return job if queues is None or job.queue in queues else None
     array, colon, index = reference.rpartition(":")
     if colon:
-        parent = find_job(session, array, queues) if index.isdecimal() and ":" not in array else None
+        parent = find_job(session, array, queues, owner) if index.isdecimal() and ":" not in array else None
         return session.get(Job, f"{parent.id}:{index}") if parent else None
     among = select(Job)
     if queues is not None:  # an expression: the index of the queue's many jobs is not to be chosen
         among = among.where((Job.queue + "").in_(queues))
-    of_name = among.where(Job.name == reference, Job.parent.is_(None))
-    named = session.scalars(of_name.order_by(Job.created_at.desc()).limit(1)).first()
-    if named:
+    newest = among.where(Job.name == reference, Job.parent.is_(None)).order_by(Job.created_at.desc()).limit(1)
+    own = session.scalars(newest.where(Job.owner == owner)).first() if owner else None
+    if named := own or session.scalars(newest).first():
         return named
     if len(reference) < 4:
         return None

@@ -23,14 +23,13 @@ from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain.errors import ClientError, SpecError, Unavailable
 from orchestrator.domain.job import Status
-from orchestrator.engines.registry import FRESH
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.own_models import AutomaticEvaluation
 from orchestrator.persistence.ownership import is_of_earlier_run
-from orchestrator.services.context import Context, Known, with_store
+from orchestrator.services.context import Context, Known
 from orchestrator.services.permissions import CONTROLLER, Actor
-from orchestrator.services.spec_submission import submit
+from orchestrator.services.spec_submission import commit_submission, inherited, submit
 from orchestrator.spec.evaluations import (
     AUTOMATIC_TAG,
     Counted,
@@ -64,8 +63,7 @@ class _Training:
     owner: str
     first_epoch: int
     spec: Mapping[str, Any]
-    place: dict[str, str]
-    """Queue and share of its evaluations."""
+    queue: str
     directory: str
     wanted: Evaluation
 
@@ -211,8 +209,8 @@ class AutomaticEvaluations:
         if wanted is None or job.first_epoch is None:
             return None
         owner, directory = job.owner or CONTROLLER.name, gang.options.directory
-        run, place = self._controller.access.store.run(job.run), place_of(job.queue, job.share, wanted)
-        return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, place, directory, wanted)
+        run = self._controller.access.store.run(job.run)
+        return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, job.queue, directory, wanted)
 
     @staticmethod
     def _claimed(run: Run, chosen: Checkpoint) -> bool:
@@ -231,14 +229,11 @@ class AutomaticEvaluations:
     def _submit(self, training: _Training, counted: Counted, chosen: Checkpoint) -> None:
         """Submit the evaluation, as the training's owner, in one transaction with the progress through the training's checkpoints."""
         controller, run = self._controller, training.run
-        controller.writes.check(adds=True)
-        controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
         try:
             actor = self._actor_named(training.owner)
             if actor is None:
                 raise ClientError(f"{training.owner}, which submitted the training, has no access any more")
-            # a key's share is the key's, whatever the training's was called when it was submitted
-            place = {key: value for key, value in training.place.items() if key != "share" or actor.share is None}
+            place = place_of(training.queue, None, wanted_of(inherited(actor, training.spec)) or training.wanted)
             spec = automatic_evaluation(run.name, training.spec, place, training.wanted, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
@@ -250,7 +245,7 @@ class AutomaticEvaluations:
                     row.checkpoint, row.job, row.open, row.problem = chosen.name, job.id, True, None
                     return job
 
-            job = with_store(controller, call)
+            job = commit_submission(controller, call)
         except (ClientError, SpecError) as error:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)
@@ -260,7 +255,6 @@ class AutomaticEvaluations:
             )
             return
         self._backoff.worked(("evaluations of", run.name))
-        controller.alarm.ring()
         passed = f"; {counted.passed} that were due have been passed over so far" if counted.passed else ""
         log.info("job %s evaluates %s@%d%s", job.id[:8], run.name, chosen.iteration, passed)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -26,7 +27,8 @@ from orchestrator.services.context import Context, Known, release, using, with_s
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
 from orchestrator.services.sources import with_teacher
-from orchestrator.services.spec_submission import Changes, answered, check, inherited, submit
+from orchestrator.services.spec_submission import Changes, check, commit_submission, inherited, submit
+from orchestrator.services.submission import record_of
 from orchestrator.services.texts import keep_again
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
@@ -83,9 +85,11 @@ def _clone(
     idempotency_key: str | None,
     teacher: TeacherCopy | None,
 ) -> dict[str, Any]:
+    record = record_of("clone", source.name, name, asdict(changes))
+
     def answered_before(known: Known) -> dict[str, Any] | None:
         with controller.database.session() as session:
-            return _answered(Context(session, controller, actor, idempotency_key, known=known), name)
+            return _answered(Context(session, controller, actor, idempotency_key, known=known), record)
 
     if earlier := with_store(controller, answered_before):
         return earlier
@@ -102,11 +106,11 @@ def _clone(
     def begin(known: Known) -> dict[str, Any]:
         with controller.writes.session() as session:
             context = Context(session, controller, actor, idempotency_key, making, teacher, known)
-            if earlier := _answered(context, name):
+            if earlier := _answered(context, record):
                 return earlier
             _check_free(session, new, context.read("taken", partial(_is_taken, new)))
             forget_gone_run(session, new)
-            job = submit(context, spec, changes.directory, f"clone {name}", environment)
+            job = submit(context, spec, changes.directory, f"clone {name}", environment, record=record)
             # before the commit: a job without its weights must not start
             description = first_description(new, job, job.owner, job.queue)
             context.publish(new.name, making, partial(making.publish, new.name, description))
@@ -118,15 +122,13 @@ def _clone(
                 making.copy()
             except DamagedCheckpoint as error:
                 raise refusal(source, chosen, error) from None
-            answer = with_store(controller, begin)
+            return commit_submission(controller, begin)
     except RunExists:
         raise ClientError(_EXISTS.format(new.name), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"the weights can't be copied into {new.path} ({error.strerror or error})", 503) from None
     finally:
         release(controller, making)
-    controller.alarm.ring()
-    return answer
 
 
 def _checked(controller: Controller, actor: Actor, source: Run, name: str, changes: Changes) -> tuple[Spec, Checkpoint]:
@@ -154,9 +156,9 @@ def _check_submission(controller: Controller, actor: Actor, spec: Spec, changes:
     return with_store(controller, call)
 
 
-def _answered(context: Context, name: str) -> dict[str, Any] | None:
-    """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another run."""
-    job = answered(context, name)
+def _answered(context: Context, record: Mapping[str, Any]) -> dict[str, Any] | None:
+    """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another request."""
+    job = submission.answered(context, record)
     if job is None:
         return None
     parent = (context.found(job.run).description() or {}).get("parent")

@@ -215,7 +215,7 @@ def _absent(controller: Controller, actor: Actor, name: str) -> ClientError:
             over = Status(job.status).is_terminal
             what = "never started; submit it again" if over else f"has not started yet: it is {job.status}"
             return ClientError(f"run {name} does not exist: job {reasons.named(job.name, job.id)} {what}", 404)
-        named = find_job(session, name, actor.queues)
+        named = find_job(session, name, actor.queues, actor.name)
         if named is not None and named.kind == "array":
             return ClientError(f"{name} is a job, not a run; {_runs_of_array(session, named)}", 404)
         if named is not None:

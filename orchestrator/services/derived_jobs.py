@@ -11,7 +11,7 @@ from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.persistence.batch_models import Job
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
-from orchestrator.services.spec_submission import inherited, submit_spec
+from orchestrator.services.spec_submission import submit_spec
 from orchestrator.spec.evaluations import document_beside, evaluation_document
 from orchestrator.spec.model import validate
 from shared_store.volume.layout import Run
@@ -55,7 +55,7 @@ def _trained(controller: Controller, actor: Actor, run: Run) -> Mapping[str, Any
     """The spec of a training. Raises ClientError where the run is none."""
     found = facts_of(run)
     with controller.database.session() as session:
-        spec = inherited(actor, spec_of(session, actor, found) or {})
+        spec = spec_of(session, actor, found) or {}
     if not spec.get("train"):
         raise ClientError(f"run {run.name} is no training, so it has no policy")
     return spec
@@ -66,4 +66,5 @@ def _submitted(controller: Controller, actor: Actor, document: Mapping[str, Any]
         spec = validate(dict(document), what)
     except SpecError as error:
         raise ClientError(str(error)) from None
-    return submit_spec(controller, actor, spec, directory, what)
+    job, _ = submit_spec(controller, actor, spec, directory, what)
+    return job

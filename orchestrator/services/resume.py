@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from typing import Any
 
 from sqlalchemy.orm import Session
@@ -13,15 +14,15 @@ from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.job import Status
-from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.ownership import FoundRun
 from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
-from orchestrator.services.context import Context, Known, archived, using, with_store
+from orchestrator.services.context import Context, Known, archived, using
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import newest_job, spec_of
 from orchestrator.services.sources import with_teacher
-from orchestrator.services.spec_submission import Changes, answered, inherited, submit
+from orchestrator.services.spec_submission import Changes, commit_submission, inherited, submit
+from orchestrator.services.submission import record_of
 from orchestrator.services.texts import keep_again
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import ALGORITHMS, Spec, Train, validate
@@ -70,8 +71,9 @@ def _resume(
         raise ClientError(f"run {run.name} was deleted a moment ago", 404)
     if is_archived(run):
         raise archived(run.name)
+    record = record_of("resume", run.name, asdict(changes))
     with controller.database.session() as session:
-        if earlier := _answered(Context(session, controller, actor, idempotency_key), found, checkpoints):
+        if earlier := _answered(Context(session, controller, actor, idempotency_key), record, found, checkpoints):
             return earlier
         document = spec_of(session, actor, found)
     with suppress(SpecError, ClientError):  # refused below, with its reason
@@ -86,13 +88,11 @@ def _resume(
             chosen.verify()  # reads all of it
         except DamagedCheckpoint as error:
             raise refusal(run, chosen, error) from None
-    controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    controller.writes.check(adds=True)
 
     def begin(known: Known) -> dict[str, Any]:
         with controller.writes.session() as session:
             context = Context(session, controller, actor, idempotency_key, teacher=teacher, known=known)
-            if earlier := _answered(context, found, checkpoints):
+            if earlier := _answered(context, record, found, checkpoints):
                 return earlier
             document = spec_of(session, actor, found)
             if document is None:
@@ -116,7 +116,7 @@ def _resume(
                 environment["MUSTER_WORLDS"] = str(_worlds(session, actor, found, before, spec, chosen))
             if chosen and changes.checkpoint is not None:
                 environment["MUSTER_CHECKPOINT"] = chosen.name
-            job = submit(context, spec, changes.directory, f"run {run.name}", environment)
+            job = submit(context, spec, changes.directory, f"run {run.name}", environment, record=record)
             return {
                 **submission.answer(job),
                 "run": run.name,
@@ -124,14 +124,14 @@ def _resume(
                 "kind": spec.kind,
             }
 
-    answer = with_store(controller, begin)
-    controller.alarm.ring()
-    return answer
+    return commit_submission(controller, begin)
 
 
-def _answered(context: Context, run: FoundRun, saved: Sequence[Checkpoint]) -> dict[str, Any] | None:
-    """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another run."""
-    job = answered(context, run.name)
+def _answered(
+    context: Context, record: Mapping[str, Any], run: FoundRun, saved: Sequence[Checkpoint]
+) -> dict[str, Any] | None:
+    """The answer to an earlier call with the same idempotency key. Raises ClientError where that was for another request."""
+    job = submission.answered(context, record)
     if job is None:
         return None
     kind = "train" if (spec_of(context.session, context.actor, run) or {}).get("train") else "command"

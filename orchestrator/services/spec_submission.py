@@ -1,33 +1,35 @@
-"""The part shared by resuming and cloning a run: the checkpoint, the changed spec, and the job that is submitted."""
+"""The submission of a spec: the one way in which a job YAML, a resumed, cloned or evaluated run, and a race become a job."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.excerpts import excerpt
-from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec, gang_needs
+from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec
+from orchestrator.domain.gang_checks import checked_gang
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.services import definitions, submission
-from orchestrator.services.arns import definition_arn
-from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import Actor, JobsOf, Operation
+from orchestrator.services.runs import newest_job
 from orchestrator.services.sources import with_teacher
 from orchestrator.services.stored_names import check_training
-from orchestrator.services.submission import Submission
-from orchestrator.spec.compile import compile_definition, compile_submission, long_texts, with_environment
+from orchestrator.services.submission import Submission, record_of
+from orchestrator.spec.compile import compile_definition, long_texts, with_environment
 from orchestrator.spec.model import Spec
 from shared_store.volume.initial_weights import TeacherCopy
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -66,14 +68,18 @@ def inherited(actor: Actor, spec: Mapping[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def answered(context: Context, run: str) -> Job | None:
-    """The job that an earlier call with the same idempotency key has submitted. Raises ClientError where that was for another run."""
-    job = submission.answered(context)
-    if job is not None and job.run != run:
-        raise ClientError(
-            f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", CONFLICT
-        )
-    return job
+def _share(context: Context, queue: JobQueue, spec: Spec) -> str | None:
+    """The share that the job asks for: its spec's, else that of the run that it reads, unless the actor's own share is in its place.
+
+    Raises StoreNeeded.
+    """
+    run = getattr(getattr(spec, spec.kind), "run", None)
+    if spec.share or run is None or queue.policy is None or context.actor.share is not None:
+        return spec.share
+    found = context.found(run)
+    if newest := newest_job(context.session, context.actor, found):
+        return newest.share
+    return ((found.description() or {}).get("spec") or {}).get("share")
 
 
 def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, Any]:
@@ -83,13 +89,15 @@ def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, 
         context,
         spec,
         named_queue(context.session, context.actor, spec.queue),
-        gang_needs(definition["nodeProperties"]),
+        checked_gang(definition["nodeProperties"]),
         what,
     )
     return definition
 
 
 def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
+    if "\0" in directory:
+        raise ClientError("directory: a zero byte is not possible; give the path of a directory")
     definition = compile_definition(spec, directory)
     context.actor.check(Operation.SUBMIT_JOB, JobsOf(named_queue(context.session, context.actor, spec.queue).name))
     check_training(context.controller.access.store, spec.document(), context.read)
@@ -101,25 +109,19 @@ def _definition(context: Context, spec: Spec, directory: str) -> dict[str, Any]:
     return definition
 
 
-class Unfit(ClientError):
-    """A job could never start in its queue, whatever else ended; ``key``: the section of its spec that asks for too much."""
-
-    def __init__(self, problem: str, what: str, *, on_gpus: bool) -> None:
-        of_evaluations = problem.startswith("evaluation: ")
-        self.key = "evaluation" if of_evaluations else "resources"
-        if what:
-            super().__init__(f"{what}: {problem}")
-        elif of_evaluations:
-            super().__init__(f"{problem}; change evaluation.resources or evaluation.queue")
-        else:
-            lower = "lower nodes or resources (cpus may be a fraction)"
-            tried = "; resources.gpus=0 and train.worlds=16 try it on CPUs, slowly" if on_gpus else ""
-            super().__init__(f"resources: {problem}; {lower}{tried}")
-
-
 def _check_fit(context: Context, spec: Spec, queue: JobQueue, gang: GangSpec, what: str) -> None:
-    if problem := fit_of(context.session, context.actor, context.controller, queue, gang).problem:
-        raise Unfit(problem, what, on_gpus=bool(spec.train and spec.resources.gpus))
+    """Raise ClientError where the job could never start in its queue, whatever else ended."""
+    problem = fit_of(context.session, context.actor, context.controller, queue, gang).problem
+    if problem is None:
+        return
+    if what:
+        raise ClientError(f"{what}: {problem}")
+    if problem.startswith("evaluation: "):
+        raise ClientError(f"{problem}; change evaluation.resources or evaluation.queue")
+    tried = (
+        "; resources.gpus=0 and train.worlds=16 try it on CPUs, slowly" if spec.train and spec.resources.gpus else ""
+    )
+    raise ClientError(f"resources: {problem}; lower nodes or resources (cpus may be a fraction){tried}")
 
 
 def submit(
@@ -129,6 +131,7 @@ def submit(
     what: str,
     environment: Mapping[str, str] | None = None,
     tags: Mapping[str, str] | None = None,
+    record: Mapping[str, Any] | None = None,
 ) -> Job:
     """Register the definition, where the newest of its name is another one, and submit the job; nothing is committed.
 
@@ -139,6 +142,7 @@ def submit(
         what: Begins the words of a refusal; empty where the spec is the caller's own, who then learns what to change.
         environment: Added on every node.
         tags: Of the job.
+        record: Of the request (:func:`.submission.record_of`), where it may come again with its idempotency key.
 
     Raises:
         ClientError: It can't be submitted as it is, or not by this actor.
@@ -147,9 +151,11 @@ def submit(
     """
     document = _definition(context, spec, directory)
     queue = named_queue(context.session, context.actor, spec.queue)
-    share = submission.open_queue(context, queue, spec.share)
-    properties = with_environment(document["nodeProperties"], environment or {})
-    gang = gang_needs(properties)
+    share = submission.open_queue(context, queue, _share(context, queue, spec))
+    properties = document["nodeProperties"]
+    if environment:
+        properties = with_environment(properties, environment)
+    gang = checked_gang(properties)
     definition = definitions.revision(context, spec.name, document, gang, again=False)
     context.actor.check(Operation.SUBMIT_JOB, definition)
     _check_fit(context, spec, queue, gang, what)
@@ -162,7 +168,7 @@ def submit(
             definition=definition,
             properties=properties,
             gang=gang,
-            record=compile_submission(spec, definition_arn(definition.name, definition.revision), environment, tags),
+            record=record or {},
             share=share,
             priority=spec.priority,
             attempts=retry["attempts"],
@@ -176,6 +182,15 @@ def submit(
     return job
 
 
+def commit_submission(controller: Controller, call: Callable[[Known], T]) -> T:
+    """Carry out a call that submits a job and commits it, and have the controller look at once. Raises what the call raises, Unavailable."""
+    controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
+    controller.writes.check(adds=True)
+    result = with_store(controller, call)
+    controller.alarm.ring()
+    return result
+
+
 def submit_spec(
     controller: Controller,
     actor: Actor,
@@ -183,31 +198,32 @@ def submit_spec(
     directory: str,
     what: str = "",
     environment: Mapping[str, str] | None = None,
+    tags: Mapping[str, str] | None = None,
     idempotency_key: str | None = None,
-) -> Job:
+) -> tuple[Job, bool]:
     """:func:`submit` of a job that neither continues nor begins a run, and its commit.
 
+    Returns:
+        The job, and whether it is new: an earlier call with the same idempotency key may have submitted it.
+
     Raises:
-        ClientError: It can't be submitted as it is, or not by this actor.
-        Unfit: It could never start.
+        ClientError: It can't be submitted as it is, or not by this actor; 409 where the key was used for another request.
         Unavailable: The store, the database or an engine does not answer.
     """
     for text in long_texts(spec):
         controller.access.calls.call(partial(controller.texts.keep, text.encode(), actor.name), works=True)
-    controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-    controller.writes.check(adds=True)
+    record = record_of("submit", spec.document(), directory, dict(environment or {}), dict(tags or {}))
 
-    def with_copy(teacher: TeacherCopy | None) -> Job:
-        def call(known: Known) -> Job:
-            def submit_once(session: Session) -> Job:
+    def with_copy(teacher: TeacherCopy | None) -> tuple[Job, bool]:
+        def call(known: Known) -> tuple[Job, bool]:
+            def submit_once(session: Session) -> tuple[Job, bool]:
                 context = Context(session, controller, actor, idempotency_key, teacher=teacher, known=known)
-                earlier = submission.answered(context)
-                return earlier or submit(context, spec, directory, what, environment)
+                if earlier := submission.answered(context, record):
+                    return earlier, False
+                return submit(context, spec, directory, what, environment, tags, record), True
 
             return controller.writes.gather(submit_once)
 
-        return with_store(controller, call)
+        return commit_submission(controller, call)
 
-    job = with_teacher(controller, with_copy)
-    controller.alarm.ring()
-    return job
+    return with_teacher(controller, with_copy)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import json
 import re
 import uuid
 from collections.abc import Mapping, Sequence
@@ -16,6 +18,7 @@ from orchestrator.control.compute_environments import queue_engines
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.gang import GangSpec
+from orchestrator.domain.gang_checks import CheckedGang
 from orchestrator.domain.identifiers import SHARE
 from orchestrator.domain.job import TERMINAL, WAITING, Status
 from orchestrator.engines.secrets import SecretsError
@@ -62,7 +65,7 @@ class Submission:
         definition: Its job definition.
         properties: Its node properties, with all overrides and parameters.
         gang: What these ask for.
-        record: The request as it came, which is kept with the job.
+        record: The request as it came, or :func:`record_of` it; kept with the job, and compared where its idempotency key comes again.
         share: From :func:`open_queue`.
         priority: Within its share.
         attempts: How often it may run.
@@ -78,7 +81,7 @@ class Submission:
     queue: JobQueue
     definition: JobDefinition
     properties: Mapping[str, Any]
-    gang: GangSpec
+    gang: CheckedGang
     record: Mapping[str, Any]
     share: str | None = None
     priority: int = 0
@@ -91,14 +94,27 @@ class Submission:
     array: int | None = None
 
 
-def answered(context: Context, record: Mapping[str, Any] | None = None) -> Job | None:
+class ShareRefused(ClientError):
+    """A job can't have the share that it names; ``aws`` says so to a client of AWS's API."""
+
+    def __init__(self, message: str, aws: str) -> None:
+        super().__init__(message)
+        self.aws = aws
+
+
+def record_of(what: str, *parts: Any) -> dict[str, str]:
+    """The record of a request of the native API: what it asked for, and the digest of its parts, which may be large."""
+    return {what: hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()}
+
+
+def answered(context: Context, record: Mapping[str, Any]) -> Job | None:
     """The job that an earlier call with the same idempotency key has submitted.
 
     Raises ClientError (409) where that was another request than ``record``.
     """
     key = _scoped(context)
     job = context.session.scalars(select(Job).where(Job.idempotency_key == key)).first() if key else None
-    if job is not None and record is not None and job.request != record:
+    if job is not None and job.request != record:
         raise ClientError(f"idempotency key {context.idempotency_key} was used for another request (job {job.id})", 409)
     return job
 
@@ -121,28 +137,34 @@ def _scoped(context: Context) -> str | None:
 def open_queue(context: Context, queue: JobQueue, share: str | None, priority: int | None = None) -> str | None:
     """The share of a job in that queue: in one with a fair-share policy, the actor's, who may name no other.
 
-    Raises ClientError where the actor may not submit there, or not with this share and priority.
+    Raises ClientError where the actor may not submit there, ShareRefused where not with this share and priority.
     """
     context.actor.check(Operation.SUBMIT_JOB, JobsOf(queue.name))
     if queue.state != "ENABLED":
         raise ClientError(f"Job queue {queue.name} is DISABLED and takes no jobs")
     if queue.policy is None and (share is not None or priority is not None):
-        # AWS's own words, with their missing space: clients match them
-        raise ClientError(
+        raise ShareRefused(
+            f"job queue {queue.name} has no fair-share policy, so its jobs have no share; leave the share out",
+            # AWS's own words, with their missing space: clients match them
             "Job with shareIdentifier or schedulingPriority can onlybe submitted to job queue with fair share "
-            "scheduling policy."
+            "scheduling policy.",
         )
     if queue.policy is not None and (own := context.actor.share) is not None:
         if share not in (None, own):
-            raise ClientError(
-                f"shareIdentifier {share[:100]!r}: jobs of {context.actor.name} have its share, which is {own}: leave shareIdentifier "
-                "(share in a YAML) out, or use a key of that share"
+            why = f"{share[:100]!r}: jobs of {context.actor.name} have its share, which is {own}: leave"
+            raise ShareRefused(
+                f"share {why} the share out, or use a key of that share",
+                f"shareIdentifier {why} shareIdentifier (share in a YAML) out, or use a key of that share",
             )
         share = own
     if queue.policy is not None and not share:
-        raise ClientError(f"Job queue {queue.name} has a fair share scheduling policy: give a shareIdentifier")
+        raise ShareRefused(
+            f"job queue {queue.name} has a fair-share policy: give the job a share",
+            f"Job queue {queue.name} has a fair share scheduling policy: give a shareIdentifier",
+        )
     if share is not None and not re.fullmatch(rf"{SHARE}\*?", share):
-        raise ClientError(f"shareIdentifier {share[:100]!r}: 1 to 255 letters and digits, a * at the end at most")
+        why = f"{share[:100]!r}: 1 to 255 letters and digits, a * at the end at most"
+        raise ShareRefused(f"share {why}", f"shareIdentifier {why}")
     if priority is not None and not 0 <= priority <= _MOST_PRIORITY:
         raise ClientError(f"schedulingPriorityOverride is {priority}; it must be 0 to {_MOST_PRIORITY}")
     return share

@@ -1,4 +1,4 @@
-"""Compiles a spec to the AWS Batch requests that carry it."""
+"""Compiles a spec to the job definition of AWS Batch that carries it."""
 
 from __future__ import annotations
 
@@ -74,28 +74,8 @@ def long_texts(spec: Spec) -> list[str]:
     return list(beside(spec.document())[1].values())
 
 
-def compile_submission(
-    spec: Spec, definition: str, environment: Mapping[str, str] | None = None, tags: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """The ``SubmitJob`` request of a spec whose definition (ARN) is registered.
-
-    ``environment`` is added on every node: the run that is continued, the checkpoint to start from. ``tags``: of the job.
-    """
-    request: dict[str, Any] = {"jobName": spec.name, "jobQueue": spec.queue, "jobDefinition": definition}
-    if spec.share:
-        request["shareIdentifier"] = spec.share
-    if tags:
-        request["tags"] = dict(tags)
-    if environment:
-        pairs = [{"name": name, "value": value} for name, value in environment.items()]
-        request["nodeOverrides"] = {
-            "nodePropertyOverrides": [{"targetNodes": "0:", "containerOverrides": {"environment": pairs}}]
-        }
-    return request
-
-
 def with_environment(properties: Mapping[str, Any], environment: Mapping[str, str]) -> dict[str, Any]:
-    """Node properties of :func:`compile_definition` with variables added on every node, as the job of :func:`compile_submission` has them."""
+    """Node properties of :func:`compile_definition` with variables added on every node: the run that is continued, say."""
     ranges = []
     for entry in properties["nodeRangeProperties"]:
         merged = {each["name"]: each["value"] for each in entry["container"]["environment"]} | dict(environment)

@@ -59,8 +59,8 @@ def document_beside(run: str, trained: Mapping[str, Any], kind: str, section: Ma
 
 
 def _kept(trained: Mapping[str, Any]) -> dict[str, Any]:
-    """What a job has of the training whose policy it reads."""
-    keys = ("queue", "share", "image", "environment", "secrets")
+    """What a job has of the training whose policy it reads; its share comes when it is submitted, by who submits it."""
+    keys = ("queue", "image", "environment", "secrets")
     return {key: trained[key] for key in keys if trained.get(key) is not None}
 
 
@@ -100,7 +100,7 @@ def automatic_evaluation(
     }
     if (trained.get("train") or {}).get("accept_changed_robot"):
         section["accept_changed_robot"] = True
-    document = evaluation_document(run, {**trained, "queue": None, "share": None}, section)
+    document = evaluation_document(run, {**trained, "queue": None}, section)
     if wanted.resources is not None:
         document["resources"] = wanted.resources.model_dump()
     document |= {"retry": wanted.retry.model_dump(), "preemptible": True, **place}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
@@ -25,6 +25,7 @@ from pydantic import (
 )
 
 from orchestrator.domain.errors import SpecError
+from orchestrator.domain.gang import DEEPEST_SPEC
 from orchestrator.spec.sections import (
     ACCEPT,
     CheckpointPolicy,
@@ -187,7 +188,9 @@ class _Spec(Section):
         default_factory=dict, description="variables and the names of their values, which the controller has"
     )
     track: TrackingServices | None = Field(default=None, description="services that get a training's metrics as well")
-    image: str = Field(default="muster", min_length=1, description="container image; engines without images ignore it")
+    image: Argument = Field(
+        default="muster", min_length=1, description="container image; engines without images ignore it"
+    )
     checkpoint: CheckpointPolicy = Field(default_factory=CheckpointPolicy)
     evaluation: Evaluation | None = Field(default=None, description="of checkpoints, while the job trains")
     logs: Logs = Field(default_factory=Logs)
@@ -295,6 +298,9 @@ def validate(
     """
     if not isinstance(value, dict):
         raise SpecError(f"{source}: expected a mapping of keys such as name, nodes, train; found {kind_of(value)}")
+    if problem := _not_storable(value):
+        path, words = problem
+        raise SpecError(f"{place_of(path, source, lines)}{words}")
     try:
         value, notes = _plain(value)
     except Refused as error:
@@ -339,15 +345,32 @@ _Problem = tuple[tuple[str | int, ...], str]
 """Keys to a value of the spec, and what is wrong with it in one line."""
 
 
-def _not_finite(document: object) -> _Problem | None:
-    """The spec travels as JSON, which has no infinity."""
+def _values(document: object) -> Iterator[tuple[tuple[str | int, ...], Any]]:
+    """Every value of a document with the keys that lead to it, the outer ones first."""
     left: list[tuple[tuple[str | int, ...], Any]] = [((), document)]
     while left:
         path, value = left.pop()
-        if isinstance(value, float) and not math.isfinite(value):
-            return path, f"expected a finite number, found {kind_of(value)}"
+        yield path, value
         items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
         left += [((*path, key), each) for key, each in items]
+
+
+def _not_finite(document: object) -> _Problem | None:
+    """The spec travels as JSON, which has no infinity."""
+    found = (
+        (path, value) for path, value in _values(document) if isinstance(value, float) and not math.isfinite(value)
+    )
+    return next(((path, f"expected a finite number, found {kind_of(value)}") for path, value in found), None)
+
+
+def _not_storable(document: object) -> _Problem | None:
+    """What could be stored but never shown again: half of a character, and more levels than an answer may have."""
+    for path, value in _values(document):
+        if len(path) >= DEEPEST_SPEC:
+            return path[:1], f"nested deeper than {DEEPEST_SPEC} levels"
+        for text in value if isinstance(value, dict) else (value,):
+            if isinstance(text, str) and not text.isascii() and any("\ud800" <= each <= "\udfff" for each in text):
+                return path, f"half of a character (a lone surrogate) in {shown(text)}; write whole ones"
     return None
 
 

@@ -16,14 +16,13 @@ from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
-from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.queries import find_job, unknown_job
 from orchestrator.services import submission
 from orchestrator.services.chosen_checkpoints import CONFLICT
-from orchestrator.services.context import Context, Known, using, with_store
+from orchestrator.services.context import using
 from orchestrator.services.models import any_model, find_model, owner_of_model
 from orchestrator.services.permissions import CONTROLLER, Actor, Owned
-from orchestrator.services.spec_submission import inherited, submit
+from orchestrator.services.spec_submission import submit_spec
 from orchestrator.spec.settings import task_config
 from racer.control import operations
 from racer.control.league_races import race_job
@@ -307,28 +306,21 @@ def _submit(
     """Submit the race of a model. Raises ClientError."""
     _checked(controller, league, model)
     facts = model.facts()
-    facts = {**facts, "spec": inherited(actor, facts.get("spec") or {})}
-    controller.writes.check(adds=True)
-    controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
-
-    def call(known: Known) -> dict[str, Any]:
-        with controller.writes.session() as session:
-            context = Context(session, controller, actor, idempotency_key, known=known)
-            earlier = submission.answered(context)
-            if earlier is not None:
-                return submission.answer(earlier)
-            queue = str(facts.get("queue") or facts["spec"].get("queue") or "default")
-            try:
-                spec = race_job(league, model.reference, facts, queue)
-            except SpecError as error:
-                raise ClientError(str(error)) from None
-            tags = {LEAGUE_TAG: league.name, MODEL_TAG: model.reference}
-            what = f"league {league.name}, race of {model.reference}"
-            return submission.answer(submit(context, spec, directory, what, tags=tags))
-
-    answer = with_store(controller, call)
-    controller.alarm.ring()
-    return {**answer, "model": model.name, "version": model.version, "run": facts["run"]}
+    queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
+    try:
+        spec = race_job(league, model.reference, facts, queue)
+    except SpecError as error:
+        raise ClientError(str(error)) from None
+    job, _ = submit_spec(
+        controller,
+        actor,
+        spec,
+        directory,
+        f"league {league.name}, race of {model.reference}",
+        tags={LEAGUE_TAG: league.name, MODEL_TAG: model.reference},
+        idempotency_key=idempotency_key,
+    )
+    return {**submission.answer(job), "model": model.name, "version": model.version, "run": facts["run"]}
 
 
 def _checked(controller: Controller, league: League, model: Model) -> Checkpoint:
@@ -368,10 +360,9 @@ def _identity(model: Model) -> dict[str, Any]:
 def _race_of(controller: Controller, actor: Actor, league: League, reference: str) -> tuple[str, str]:
     """Id and run of a job that has succeeded, and was submitted while the league was open. Raises ClientError."""
     with controller.database.session() as session:
-        queues = actor.queues
-        job = find_job(session, reference, queues)
+        job = find_job(session, reference, actor.queues, actor.name)
         if job is None:
-            raise ClientError(unknown_job(session, reference, queues), 404)
+            raise ClientError(unknown_job(session, reference, actor.queues, actor.name), 404)
         actor.check(operations.ENTER_LEAGUE, job)
         if job.status != Status.SUCCEEDED:
             raise ClientError(

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from orchestrator.spec.model import Spec
+
 NEEDS = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "64"}]
 
 
@@ -34,3 +36,9 @@ def multinode(name: str, container: Mapping[str, Any], nodes: int = 1, **more: A
 def single(name: str, container: Mapping[str, Any], **more: Any) -> dict[str, Any]:
     """RegisterJobDefinition of a job of one container."""
     return {"jobDefinitionName": name, "type": "container", "containerProperties": container, **more}
+
+
+def submission_of(spec: Spec, definition: str) -> dict[str, Any]:
+    """SubmitJob of a job YAML whose definition (name or ARN) a client of AWS's API has registered."""
+    share = {"shareIdentifier": spec.share} if spec.share else {}
+    return {"jobName": spec.name, "jobQueue": spec.queue, "jobDefinition": definition, **share}

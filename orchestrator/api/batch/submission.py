@@ -13,7 +13,7 @@ from orchestrator.persistence.batch_models import Job
 from orchestrator.services.arns import split_reference
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation
-from orchestrator.services.submission import Submission, Wait, answer, answered, open_queue, submit
+from orchestrator.services.submission import ShareRefused, Submission, Wait, answer, answered, open_queue, submit
 
 _MOST_DEPENDENCIES = 20
 _ARRAY_SIZES = range(2, 10_001)
@@ -32,7 +32,10 @@ def _submission(context: Context, request: Mapping[str, Any]) -> Submission:
     validation.check_tries(request)
     validation.check_tags(request.get("tags") or {})
     queue, override = context.queue(request["jobQueue"]), request.get("schedulingPriorityOverride")
-    share = open_queue(context, queue, request.get("shareIdentifier"), override)
+    try:
+        share = open_queue(context, queue, request.get("shareIdentifier"), override)
+    except ShareRefused as error:
+        raise ClientError(error.aws) from None
     definition = context.definition(request["jobDefinition"])
     context.actor.check(Operation.SUBMIT_JOB, definition)
     document = definition.document

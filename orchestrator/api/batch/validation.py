@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import json
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -12,22 +11,15 @@ from orchestrator.api.batch.ecs import container_name, from_ecs, override_from_e
 from orchestrator.api.batch.members import check_consumables, check_members
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.domain.errors import ClientError
-from orchestrator.domain.gang import MOST_NODES, GangSpec, gang_needs, target_nodes
-from orchestrator.domain.native_options import MalformedOptions
+from orchestrator.domain.gang import MOST_NODES, target_nodes
+from orchestrator.domain.gang_checks import CheckedGang, checked_gang
 from shared_store.contract.error_text import shown
-from shared_store.contract.node import LEAST_LOG_LIMIT
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
 _MOST_NODES, _MOST_RANGES, _MOST_TAGS, _MOST_CONDITIONS = 1000, 5, 50, 5
 _SHORTEST_TIMEOUT = 60
-_DEEPEST_SPEC = 100
-"""Levels of MUSTER_SPEC; what is nested much deeper can be stored, but no answer could show it."""
 NO_KUBERNETES = "is not supported: no engine is a Kubernetes cluster;"
-_MALFORMED = (
-    "MUSTER_SPEC, MUSTER_STALL_TIMEOUT, MUSTER_LOG_LIMIT (bytes, at least 1048576) or MUSTER_RANKS_PER_NODE (at least 1) is malformed; "
-    "they are written by `muster submit`"
-)
 
 
 def check_name(key: str, name: str) -> None:
@@ -84,7 +76,7 @@ def _check_condition(condition: Mapping[str, str]) -> None:
         raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
-def check_nodes(properties: Mapping[str, Any], kind: str) -> GangSpec:
+def check_nodes(properties: Mapping[str, Any], kind: str) -> CheckedGang:
     """Check the nodes of a definition of type ``kind``, or of a job of it once its overrides are applied. Raises ClientError.
 
     ``properties``: as :func:`node_properties` gives them. Returns the gang that they ask for.
@@ -101,39 +93,14 @@ def check_nodes(properties: Mapping[str, Any], kind: str) -> GangSpec:
         where = _where(entry, kind)
         check_container(entry["container"], where)
         _check_target(target, count)
-    try:
-        gang = gang_needs(properties)
-    except MalformedOptions:
-        raise ClientError(_MALFORMED) from None
-    except ValueError as error:
-        raise ClientError(str(error)) from None
+    gang = checked_gang(properties)
     if count > _MOST_NODES and not gang.options.is_native:
         raise _too_many(count)
-    _check_options(gang)
     return gang
 
 
 def _too_many(count: int) -> ClientError:
     return ClientError(f"numNodes is {count}; a multi-node parallel job has 1 to {_MOST_NODES} nodes")
-
-
-def _check_options(gang: GangSpec) -> None:
-    """Check the ``MUSTER_*`` variables that the controller itself reads."""
-    try:
-        spec = gang.spec
-        json.dumps(spec, ensure_ascii=False).encode()  # half of a character can't be shown
-        if _depth(spec) > _DEEPEST_SPEC or not LEAST_LOG_LIMIT <= gang.options.log_limit < 2**63:
-            raise ValueError
-    except (ValueError, RecursionError):
-        raise ClientError(_MALFORMED) from None
-    if gang.options.on_child_failure not in ("restart", "fail", "ignore"):
-        raise ClientError("MUSTER_ON_CHILD_FAILURE: expected restart, fail or ignore")
-
-
-def _depth(value: object) -> int:
-    """Number of levels of nested lists and mappings. Raises RecursionError."""
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return 1 + max(map(_depth, inner), default=0)
 
 
 def _check_target(target: str, count: int) -> None:
@@ -151,16 +118,8 @@ def check_container(container: Mapping[str, Any], where: str) -> None:
     if not container.get("image"):
         raise ClientError(f"Error executing request, Exception : {where}: Container image is not provided.")
     check_members(container, where)
-    for pair in container.get("environment") or []:
-        name = pair.get("name")
-        if not name:
-            raise ClientError(f"{where}: an entry of environment has no name")
-        if name.startswith("AWS_BATCH"):
-            raise ClientError(f"environment variable {name[:100]}: names that start with AWS_BATCH are reserved")
-        if "=" in name or "\0" in name + pair.get("value", ""):
-            raise ClientError(
-                f"environment variable {name[:100]!r}: neither '=' in the name nor a zero byte is possible"
-            )
+    if not all(pair.get("name") for pair in container.get("environment") or []):
+        raise ClientError(f"{where}: an entry of environment has no name")
     if any("\0" in part for part in container.get("command") or []):
         raise ClientError(f"{where}: a zero byte in the command")
     resources = container.get("resourceRequirements") or []

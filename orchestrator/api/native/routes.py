@@ -66,10 +66,10 @@ router.include_router(submit_routes.router)
 
 def permitted_job(session: Session, actor: Actor, reference: str, operation: Operation) -> Job:
     """The job, where the caller may do this to it. Raises ClientError."""
-    queues = actor.queues
-    job = find_job(session, reference, queues)
+    who = actor.queues, actor.name
+    job = find_job(session, reference, *who)
     if job is None:
-        raise ClientError(_jobs_of_run(session, actor, reference) or unknown_job(session, reference, queues), 404)
+        raise ClientError(_jobs_of_run(session, actor, reference) or unknown_job(session, reference, *who), 404)
     actor.check(operation, job)
     return job
 
@@ -121,13 +121,13 @@ def job_detail(
     reference: str,
     store: Annotated[bool, Query(description="whether to read the run in the store: its results and progress")] = True,
 ) -> Any:
-    """A job by id, by the start of its id, or by name (the newest): every attempt and node, its run and its results.
+    """A job by id, by the start of its id, or by name (the newest of the caller, else of all): every attempt and node, its run and its results.
 
     ``awsCode``: what the AWS Batch API states beyond ``statusReason``: AWS's code, or AWS's own words. ``ranSeconds``: how long all
     attempts ran, together. ``phase``: what a training does at present. ``children``: of an array, those that failed first.
     ``storeProblem``: why there are no results, where the store does not answer. ``runIsGone``: it was deleted;
     ``runIsReplaced``: another run has its name now.
-    ``withoutEffect``: members of its definition for Fargate, which change nothing here.
+    ``isOwn``: the caller has submitted it. ``withoutEffect``: members of its definition for Fargate, which change nothing here.
     """
     controller, actor = controller_of(request), actor_of(request)
     with controller.database.session() as session:
@@ -157,6 +157,7 @@ def job_detail(
                 "id": job.id,
                 "name": job.name,
                 "owner": job.owner,
+                "isOwn": job.owner == actor.name,
                 "run": job.run,
                 "runIsReplaced": is_replaced,
                 "runIsGone": is_gone,

@@ -33,7 +33,7 @@ def submit_job(
 ) -> dict[str, Any]:
     """Submit the job of a spec; a second call with the same idempotency key gets the answer of the first one.
 
-    ``notes``: warnings about the spec.
+    409 where that key came with another request. ``notes``: warnings about the spec.
     """
     controller, actor = controller_of(request), actor_of(request)
     actor.check(Operation.SUBMIT_SPEC)
@@ -41,7 +41,7 @@ def submit_job(
         spec = from_document(body.spec, "spec")
     except SpecError as error:
         raise ClientError(str(error)) from None
-    job = submit_spec(
+    job, _ = submit_spec(
         controller,
         actor,
         spec,

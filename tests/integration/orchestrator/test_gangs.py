@@ -14,22 +14,20 @@ from typing import Any
 
 import pytest
 
-from orchestrator.api.batch import validation
 from orchestrator.console.job_facts import facts_of
 from orchestrator.console.jobs import _row as jobs_page_row
-from orchestrator.domain import attempt
+from orchestrator.domain import attempt, gang_checks
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.persistence import gangs
-from orchestrator.services import spec_submission as continuing
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
 from shared_store.volume.layout import Store
 from shared_store.volume.log_view import Chosen
 from shared_store.volume.log_windows import first_error
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
-from tests.support.definitions import container, single
+from tests.support.definitions import container, single, submission_of
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
 from tests.support.processes import processes_of
 
@@ -204,7 +202,7 @@ def test_the_nodes_of_a_job_are_read_once_whoever_needs_them(tmp_path: Path, mon
         read.append(node_properties["numNodes"])
         return gang_needs(node_properties)
 
-    for module in (validation, gangs, continuing):
+    for module in (gang_checks, gangs):
         monkeypatch.setattr(module, "gang_needs", counting)
     spec = validate({"name": "say", "command": ["echo", "here"], "resources": {"cpus": 0.1, "memory": 64}}, "job.yaml")
     with serving(tmp_path) as client:
@@ -212,7 +210,7 @@ def test_the_nodes_of_a_job_are_read_once_whoever_needs_them(tmp_path: Path, mon
         await_status(client, job, "SUCCEEDED")
         assert len(detail(client, job)["attempts"][0]["nodes"]) == 2 and read == [2, 2], "from submission to end"
         registered = client.batch("RegisterJobDefinition", **compile_definition(spec, str(tmp_path)))
-        submitted = client.batch("SubmitJob", **compile_submission(spec, registered["jobDefinitionArn"]))
+        submitted = client.batch("SubmitJob", **submission_of(spec, registered["jobDefinitionArn"]))
         run = await_status(client, submitted["jobId"], "SUCCEEDED")["run"]
         read.clear()
         resumed = client.post(f"/api/runs/{run}/resume", {})["jobId"]

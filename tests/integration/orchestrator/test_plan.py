@@ -15,11 +15,11 @@ from orchestrator.domain.errors import ApiError, SpecError
 from orchestrator.engines.api import Gang, Plan
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.server import Server
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
 from shared_store.volume.files import write_json
 from tests.conftest import Serving, wait_for
-from tests.support.definitions import container, multinode
+from tests.support.definitions import container, multinode, submission_of
 from tests.support.orchestrator.jobs import jobs_of, serving
 
 SPEC = "job_specs/cartpole.yaml"
@@ -64,7 +64,7 @@ def test_a_plan_has_the_same_input_as_a_submission(tmp_path: Path, monkeypatch: 
     with serving(tmp_path) as client:
         client.post("/api/plan", {"definition": compile_definition(spec, "/nowhere")})
         client.batch("RegisterJobDefinition", **compile_definition(spec, "/nowhere"))
-        client.batch("SubmitJob", **compile_submission(spec, "same"))
+        client.batch("SubmitJob", **submission_of(spec, "same"))
         wait_for(lambda: len(given) == 2, 30, "the launch")
     planned, submitted = given
     assert (planned.priority, planned.stall_timeout, planned.timeout) == (7, 180.0, 3600)

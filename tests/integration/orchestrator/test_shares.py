@@ -85,10 +85,10 @@ def test_a_job_has_the_share_of_its_key_and_may_name_no_other(lab: Lab) -> None:
     assert [lab.spec(who) for who in ("ann-1", "bob")] == ["ann1", "lab"]
     assert lab.submit("ann-1", shareIdentifier="ann1") == lab.spec("ann-1", share="ann1") == "ann1"
     assert lab.submit("bob", schedulingPriorityOverride=7) == "lab"
-    words = "shareIdentifier 'other': jobs of key ann-1 have its share, which is ann1: leave shareIdentifier"
-    for submit in (
-        lambda: lab.submit("ann-1", shareIdentifier="other"),
-        lambda: lab.spec("ann-1", share="other"),
+    why = "'other': jobs of key ann-1 have its share, which is ann1: leave"
+    for submit, words in (
+        (lambda: lab.submit("ann-1", shareIdentifier="other"), f"shareIdentifier {why} shareIdentifier"),
+        (lambda: lab.spec("ann-1", share="other"), f"share {why} the share out"),
     ):
         with pytest.raises(ApiError, match=words) as caught:
             submit()
@@ -96,7 +96,11 @@ def test_a_job_has_the_share_of_its_key_and_may_name_no_other(lab: Lab) -> None:
     assert lab.submit("ann-1", queue="default") is None, "a queue without a policy knows no shares"
     with pytest.raises(ApiError, match="can onlybe submitted to job queue with fair share"):
         lab.submit("ann-1", queue="default", shareIdentifier="ann1")
-    with pytest.raises(ApiError, match="evaluation: shareIdentifier 'other'"):
+    with pytest.raises(
+        ApiError, match=r"^job queue default has no fair-share policy, so its jobs have no share; leave"
+    ):
+        lab.spec("ann-1", queue="default", share="ann1")
+    with pytest.raises(ApiError, match="evaluation: share 'other'"):
         lab.spec(
             "ann-1",
             train=SPEC["train"],
@@ -110,6 +114,8 @@ def test_a_caller_without_a_key_names_the_share_itself(lab: Lab) -> None:
     assert lab.submit("token", shareIdentifier="anybody") == lab.spec("token", share="anybody") == "anybody"
     with pytest.raises(ApiError, match="has a fair share scheduling policy: give a shareIdentifier"):
         lab.submit("token")
+    with pytest.raises(ApiError, match=r"^job queue fair has a fair-share policy: give the job a share$"):
+        lab.spec("token")
 
 
 def test_a_job_that_comes_from_anothers_run_has_the_share_of_the_one_who_submits_it(lab: Lab) -> None:
@@ -121,6 +127,9 @@ def test_a_job_that_comes_from_anothers_run_has_the_share_of_the_one_who_submits
         assert actor is not None
         job = derived_jobs.evaluate(server.controller, actor, store.run("taught"), {"episodes": 1}, "")
         assert lab.share_of(job.id) == share, name
+    exported = {"resources": {"cpus": 1}, "command": None, "export": {"run": "taught"}}
+    found = {who: lab.spec(who, **exported) for who in ("bob", "ann-1", "token")}
+    assert found == {"bob": "lab", "ann-1": "ann1", "token": "ann1"}, "a spec that reads the run and names no share"
 
 
 def test_automatic_evaluations_have_the_share_that_the_trainings_owner_has_now(lab: Lab, tmp_path: Path) -> None:

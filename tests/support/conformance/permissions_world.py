@@ -12,14 +12,14 @@ import httpx
 from orchestrator.api.logs import operations as logs
 from orchestrator.client import Client
 from orchestrator.services.permissions import HIDDEN
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
 from shared_store.volume import models, texts
 from shared_store.volume.bundles import seal
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.layout import Store
 from tests.conftest import Serving
-from tests.support.definitions import container, multinode
+from tests.support.definitions import container, multinode, submission_of
 from tests.support.keys import HomeKeys
 
 TOKEN = "a-token-for-tests-alone"
@@ -81,7 +81,7 @@ class World:
         document = {"name": "theirs", "queue": queue, "command": ["echo", MARK], "environment": {"SECRET": SECRET}}
         spec = validate({**document, "resources": {"cpus": 0.1}, **changes}, "job.yaml")
         name = self.register(key, f"native-{self.fresh()}", **compile_definition(spec, ""))
-        job = self.clients[key].batch("SubmitJob", **compile_submission(spec, name))["jobId"]
+        job = self.clients[key].batch("SubmitJob", **submission_of(spec, name))["jobId"]
         return job, f"{spec.name}-{job[:8]}"
 
     def register(self, key: str, name: str, **request: Any) -> str:

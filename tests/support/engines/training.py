@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 from orchestrator.spec import file as specfile
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition
 from tests.conftest import REPOSITORY, Serving
+from tests.support.definitions import submission_of
 from tests.support.engines.images import PATH, SUPERVISED, host_files
 from tests.support.waiting import PATIENCE
 
@@ -28,7 +29,7 @@ def submit(serving: Serving, run: str, engine: str, iterations: int, *more: str)
         container |= {"image": SUPERVISED, **host_files()}
         container["environment"].append({"name": "PATH", "value": PATH})
     arn = serving.client.batch("RegisterJobDefinition", **request)["jobDefinitionArn"]
-    submission = {**compile_submission(spec, arn), "jobQueue": queue}
+    submission = {**submission_of(spec, arn), "jobQueue": queue}
     job: str = serving.client.batch("SubmitJob", **submission)["jobId"]
     return job
 

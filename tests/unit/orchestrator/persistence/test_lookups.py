@@ -51,6 +51,8 @@ LOOKS: dict[str, Callable[[Session], object]] = {
     "by id": lambda session: find_job(session, ARRAY),
     "by name": lambda session: find_job(session, "ant"),
     "by name in one queue": lambda session: find_job(session, "ant", ["other"]),
+    "by name, of an owner": lambda session: find_job(session, "ant", None, "ann"),
+    "by name, of an owner without one": lambda session: find_job(session, "ant", None, "eve"),
     "by the name of an array": lambda session: find_job(session, "array"),
     "by a name that there is not": lambda session: find_job(session, "a name that is not there"),
     "by the beginning of an id": lambda session: find_job(session, "bbbb"),
@@ -95,3 +97,30 @@ def test_the_beginning_of_an_array_s_id_is_not_that_of_its_children(database: Da
         found = find_job(session, "aaaaaaaa")
         assert found is not None and found.id == ARRAY
     assert any("LIMIT" in statement for statement in statements)
+
+
+NAMED = {
+    ("ant", "ann", None): "ann-new",
+    ("ant", "bob", None): "bob",
+    ("ant", "eve", None): "bob",
+    ("ant", None, None): "bob",
+    ("ant", "bob", ("lab",)): "ann-new",
+    ("ant:3", "ann", None): "ann-new:3",
+    ("ann-old", "bob", None): "ann-old",
+}
+"""By a reference, who asks, and the queues of who asks."""
+
+
+@pytest.mark.parametrize("case", NAMED)
+def test_a_name_is_ones_own_job_before_that_of_another(tmp_path: Path, case: tuple[str, str, tuple[str]]) -> None:
+    database = Database.at(tmp_path)
+    with database.session() as session:
+        session.add(job("ann-old", name="ant", owner="ann", queue="lab", created_at=1))
+        session.add(job("ann-new", name="ant", owner="ann", queue="lab", created_at=2, kind="array", array_size=4))
+        session.add(job("bob", name="ant", owner="bob", queue="default", created_at=3))
+        session.add(job("ann-new:3", name="ant", owner="ann", queue="lab", parent="ann-new", created_at=2))
+    with database.session() as session:
+        reference, owner, queues = case
+        found = find_job(session, reference, queues, owner)
+        assert found is not None and found.id == NAMED[case]
+    database.close()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 from typing import Any
 
@@ -14,7 +15,7 @@ from hypothesis import strategies as st
 from orchestrator.domain.gang import gang_needs, target_nodes
 from orchestrator.domain.native_options import MalformedOptions, NativeOptions
 from orchestrator.domain.resources import Resources
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition, with_environment
 from orchestrator.spec.model import validate
 
 TRAIN = {"task": "Cartpole", "worlds": 4, "iterations": 2, "ppo": {"clip": 0.3}}
@@ -91,27 +92,19 @@ def test_the_user_s_environment_is_carried_and_a_job_without_a_timeout_has_none(
     assert (environment["A"], environment["EMPTY"]) == ("b c", "") and "timeout" not in made
 
 
-def test_a_submission_names_job_queue_and_definition_and_its_variables_are_added_on_every_node() -> None:
-    spec = validate({"name": "ant", "queue": "gpu", "command": ["x"]}, "s")
-    named = {"jobName": "ant", "jobQueue": "gpu", "jobDefinition": "arn:1"}
-    assert compile_submission(spec, "arn:1") == named
-    added = {"environment": [{"name": "MUSTER_RUN", "value": "old"}]}
-    overrides = [{"targetNodes": "0:", "containerOverrides": added}]
-    told = compile_submission(spec, "arn:1", {"MUSTER_RUN": "old"})
-    assert told["nodeOverrides"]["nodePropertyOverrides"] == overrides
+def test_variables_are_added_on_every_node_and_the_definition_stays() -> None:
+    made = definition(command=["x"], environment={"A": "b", "C": "d"})["nodeProperties"]
+    before = copy.deepcopy(made)
+    added = gang_needs(with_environment(made, {"MUSTER_RUN": "old", "C": "e"})).nodes[0].environment
+    assert (added["A"], added["C"], added["MUSTER_RUN"]) == ("b", "e", "old") and made == before
 
 
-def test_aws_s_own_model_of_the_api_accepts_both_requests() -> None:
+def test_aws_s_own_model_of_the_api_accepts_the_definition() -> None:
     service = botocore.session.get_session().get_service_model("batch")
     spec = validate({"name": "ant", "train": TRAIN, "nodes": {"min": 2, "max": 4}, "timeout": "2h"}, "s")
-    requests = {
-        "RegisterJobDefinition": compile_definition(spec, "/home/me"),
-        "SubmitJob": compile_submission(spec, "arn:aws:batch:x:1:job-definition/ant:1", {"MUSTER_RUN": "old"}),
-    }
-    for operation, request in requests.items():
-        shape = service.operation_model(operation).input_shape
-        report = botocore.validate.ParamValidator().validate(request, shape)
-        assert not report.has_errors(), report.generate_report()
+    shape = service.operation_model("RegisterJobDefinition").input_shape
+    report = botocore.validate.ParamValidator().validate(compile_definition(spec, "/home/me"), shape)
+    assert not report.has_errors(), report.generate_report()
 
 
 # -- reading ----------------------------------------------------------------------------------------------------------

@@ -16,12 +16,13 @@ from orchestrator.domain.errors import ClientError
 from orchestrator.services.resume import _check_changes, _check_rate
 from orchestrator.services.spec_submission import Changes
 from orchestrator.spec.changes import override
-from orchestrator.spec.compile import compile_definition, compile_submission
+from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import ALGORITHMS, Spec, validate
 from shared_store.contract.plugins import sections
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.run_settings import setting_at
+from tests.support.definitions import submission_of
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.refusals import refusal
 
@@ -137,7 +138,7 @@ def changed(kind: str, *assignments: str, **train: Any) -> tuple[Spec, Spec]:
 
 
 def requests_of(spec: Spec) -> tuple[dict[str, Any], dict[str, Any]]:
-    return compile_definition(spec, "/"), compile_submission(spec, "arn")
+    return compile_definition(spec, "/"), submission_of(spec, "arn")
 
 
 def test_every_key_of_the_spec_is_in_one_of_the_tables() -> None:
