@@ -33,7 +33,7 @@ from shared_store.volume.layout import Store
 
 @dataclass(frozen=True)
 class Controller:
-    """What use cases and the server are made of; each takes the parts that it needs."""
+    """The parts of a running controller, by name: what use cases act on and the server is made of. It does nothing itself."""
 
     database: Database
     writes: Writes
