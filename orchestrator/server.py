@@ -93,7 +93,7 @@ class Server:
     ) -> None:
         """Take the lock, the port, the engines, the store and the database, in this order; nothing runs until :meth:`start`.
 
-        ``rate_limit``, ``submit_rate_limit``: requests and SubmitJobs per second that each key may send; 0: any number.
+        ``rate_limit``, ``submit_rate_limit``: requests and submissions per second that each key may send; 0: any number.
         ``database``: URL, or path of an SQLite file, where it is not that of the home directory. ``min_free``: what must be free on
         the volumes of the store and the database for something new to start. ``retention``: seconds for which ended jobs are kept, as
         :class:`orchestrator.control.retention.Retention` says. ``engines``: names from :data:`orchestrator.engines.installed.ENGINES`; the queue ``default`` belongs to the

@@ -188,7 +188,10 @@ def serve(
         ),
     ] = None,
     submit_rate_limit: Annotated[
-        int, typer.Option(min=0, help="SubmitJob requests per second of each key (AWS: 50); 0: unlimited.")
+        int,
+        typer.Option(
+            min=0, help="Submissions (SubmitJob, POST /api/jobs) per second of each key (AWS: 50); 0: unlimited."
+        ),
     ] = 0,
     secrets: Annotated[
         str | None,

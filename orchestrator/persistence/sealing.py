@@ -1,6 +1,7 @@
 """Sealing of secrets: the database holds them encrypted, and the file that opens them lies in the home directory.
 
-A copy of the database alone, such as a backup or a PostgreSQL server, reveals no secret.
+A copy of the database alone, such as a backup or a PostgreSQL server, reveals none of these: no access key, no session, no webhook. The
+environments of jobs are there as they were submitted, in clear.
 """
 
 from __future__ import annotations

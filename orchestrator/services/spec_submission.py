@@ -79,7 +79,9 @@ def _share(context: Context, queue: JobQueue, spec: Spec) -> str | None:
     found = context.found(run)
     if newest := newest_job(context.session, context.actor, found):
         return newest.share
-    return ((found.description() or {}).get("spec") or {}).get("share")
+    described = (found.description() or {}).get("spec")  # written by a job: it may say anything
+    share = described.get("share") if isinstance(described, Mapping) else None
+    return share if isinstance(share, str) else None
 
 
 def check(context: Context, spec: Spec, directory: str, what: str) -> dict[str, Any]:

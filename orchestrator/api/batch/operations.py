@@ -87,7 +87,7 @@ def validate(operation: str, request: object) -> dict[str, Any]:
 def call(
     controller: Controller, actor: Actor, operation: str, request: object, idempotency_key: str | None = None
 ) -> dict[str, Any]:
-    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`Controller.check_writable`)."""
+    """Carry out one operation. Raises ClientError; DatabaseError where it writes and can't (:meth:`orchestrator.control.writes.Writes.check`)."""
     handler = OPERATIONS.get(operation)
     if handler is None:
         instead = next((use for part, use in _INSTEAD.items() if part in operation), None)

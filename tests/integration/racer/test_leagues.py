@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import httpx
 import numpy as np
 import pytest
 
@@ -174,6 +175,23 @@ def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     said = cups.refused("submit", "long", "fast@2", "--evaluation", job)
     assert "is RUNNABLE: only a race that has SUCCEEDED" in said
     cups.server.client.batch("TerminateJob", jobId=job, reason="seen")
+
+
+def test_an_idempotency_key_answers_the_same_race_alone(cups: Paddock) -> None:
+    before = len(cups.races())
+
+    def raced(key: str, **body: Any) -> httpx.Response:
+        headers = {"X-Muster-Idempotency-Key": key}
+        url = f"{cups.server.client.url}/api/leagues/cup/races"
+        return httpx.post(url, json={"model": "fast", "version": 1, **body}, headers=headers, timeout=60)
+
+    first = raced("a-race").json()["jobId"]
+    assert raced("a-race").json()["jobId"] == first and len(cups.races()) == before + 1
+    for other in ({"version": 2}, {"directory": "/elsewhere"}):
+        refused = raced("a-race", **other)
+        assert refused.status_code == 409 and "was used for another request" in refused.json()["message"]
+    assert len(cups.races()) == before + 1
+    cups.server.client.batch("TerminateJob", jobId=first, reason="seen")
 
 
 def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_path: Path) -> None:
