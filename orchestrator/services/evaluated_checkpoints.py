@@ -1,21 +1,35 @@
-"""Checks of the checkpoint that a job evaluates, before the job exists."""
+"""Checks of the checkpoint that a job evaluates, exports or shows, before the job exists."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import choose, refusal
 from orchestrator.services.stored_names import check_names
 from orchestrator.spec.settings import task_config
+from orchestrator.spec.values import task_name
 from shared_store.contract import plugins
-from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
+from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.run_settings import merged
 
 if TYPE_CHECKING:
     from shared_store.contract.plugins import EvaluationRules
+
+
+def check_task(run: Run) -> None:
+    """Raise ClientError where the task of a run's policy is not installed here, as its submission and its resuming would."""
+    with suppress(DamagedCheckpoint):  # which the job that reads it names
+        checkpoints = list_checkpoints(run)
+        task = checkpoints[-1].manifest.get("task") if checkpoints else None
+        if isinstance(task, str):
+            try:
+                task_name(task)
+            except ValueError as error:
+                raise ClientError(f"run {run.name}: train.task: {error}") from None
 
 
 def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str = "evaluate") -> Checkpoint | None:

@@ -16,7 +16,7 @@ from orchestrator.persistence.batch_models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.services.context import Context, archived, permitted_run, release
-from orchestrator.services.evaluated_checkpoints import check_evaluation
+from orchestrator.services.evaluated_checkpoints import check_evaluation, check_task
 from orchestrator.services.permissions import Operation
 from orchestrator.services.stored_names import check_training
 from shared_store.contract import plugins
@@ -41,6 +41,11 @@ class SourceRun:
     """Of a teacher: the iteration or the name of its checkpoint; the newest one where empty."""
     reference: str = ""
     """Of a teacher: run and checkpoint as the spec has them."""
+
+    @property
+    def is_teacher(self) -> bool:
+        """Whether the job's policy imitates it; else the job loads its task."""
+        return self.key == _TEACHER
 
 
 def sources_of(gang: GangSpec) -> list[SourceRun]:
@@ -77,7 +82,7 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
     teacher = None
     mains = set(_sources(gang.nodes[gang.main]))
     for source in sources_of(gang):
-        is_teacher = source.key == _TEACHER
+        is_teacher = source.is_teacher
         if is_teacher and context.read(("held", source), partial(_is_held, context, gang, source)):
             continue
         context.controller.access.users.check(source.run)
@@ -94,6 +99,8 @@ def check_sources(context: Context, gang: GangSpec, is_waiting: bool) -> Teacher
             owner = owner_of(context.session, context.found(source.run))
             if owner is None or not context.actor.may_see(owner):  # another's is as one that does not exist yet
                 context.actor.check(Operation.SUBMIT_JOB, RunRecord(name=source.run, queue=""))
+        if not is_teacher and not is_waiting:
+            context.read(("task", source.run), partial(check_task, context.run(source.run)))
         if source.key in plugins.evaluating() and not is_waiting:
             evaluated = partial(check_evaluation, store, context.run(source.run), spec or {}, source.key)
             context.read((source.key, source.run), evaluated)

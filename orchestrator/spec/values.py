@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import excerpt
+from orchestrator.spec.task_modules import module_problem
 from shared_store.contract.error_text import shown, unknown_task
 from shared_store.volume.layout import NAME
 
@@ -76,11 +77,16 @@ def _job_name(value: str) -> str:
     return value
 
 
-def _task_name(value: str) -> str:
-    known = known_tasks()
-    if ":" in value or value in known:
+def task_name(value: str) -> str:
+    """The name of an installed task, or ``module:Class``. Raises ValueError for another, and where the task can't be imported."""
+    places = {point.name: point.value for point in entry_points(group="muster.tasks")}
+    if ":" in value:
         return value
-    raise ValueError(unknown_task(value, known))
+    if value not in places:
+        raise ValueError(unknown_task(value, sorted(places)))
+    if words := module_problem(places[value]):
+        raise ValueError(f"task {value} can't be imported: {words}; install another version of its package")
+    return value
 
 
 def _environment(value: dict[str, str]) -> dict[str, str]:
@@ -117,7 +123,7 @@ Memory = Annotated[int, BeforeValidator(_mebibytes)]
 Size = Annotated[int, BeforeValidator(_bytes)]
 RunName = Annotated[str, AfterValidator(_run_name)]
 JobName = Annotated[str, AfterValidator(_job_name)]
-TaskName = Annotated[str, AfterValidator(_task_name)]
+TaskName = Annotated[str, AfterValidator(task_name)]
 Environment = Annotated[dict[str, str], AfterValidator(_environment)]
 Secrets = Annotated[dict[str, str], AfterValidator(_secrets)]
 Argument = Annotated[str, AfterValidator(_argument)]

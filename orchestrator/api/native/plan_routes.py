@@ -23,7 +23,7 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
 from orchestrator.services.context import permitted_run
-from orchestrator.services.evaluated_checkpoints import check_evaluation
+from orchestrator.services.evaluated_checkpoints import check_evaluation, check_task
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import JobsOf, Operation
 from orchestrator.services.sources import sources_of
@@ -51,6 +51,8 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     check_training(controller.access.store, wanted.spec)
     for source in sources_of(wanted):
         run = permitted_run(controller, actor, source.run, Operation.READ_RUN)
+        if not source.is_teacher:
+            check_task(run)
         if source.key in plugins.evaluating():
             check_evaluation(controller.access.store, run, wanted.spec or {}, source.key)
     controller.engines.capacity(patience=FRESH)  # before the transaction, which must not wait for an engine

@@ -34,6 +34,9 @@ def store(full: Serving) -> Store:
             for i in range(1, 10):
                 metrics.write({"iteration": i, "env_steps": 100 * i, "reward": reward, "episode_length": 5})
     add_run(store, "empty")
+    gone = {**SPEC["train"], "task": "Vanished"}
+    add_run(store, "gone", {**SPEC, "name": "gone", "train": gone})
+    add_checkpoint(store, "gone", 9, task="Vanished", train=gone)
     for iteration, mean in ((9, 21.0), (6, 29.0)):
         evaluated(store, "taught", f"{iteration:08d}-e1-0123abcd", mean)
     evaluated(store, "taught-b", "00000009-e1", 25.0)
@@ -66,6 +69,21 @@ REFUSED = {
 @pytest.mark.parametrize("line", REFUSED)
 def test_what_can_not_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
     assert REFUSED[line] in refusal(full, "evaluate", *shlex.split(line))
+
+
+@pytest.mark.parametrize("kind", ["evaluate", "export", "render", "resume", "clone"])
+def test_a_run_whose_task_is_not_installed_is_refused_with_the_same_line(full: Serving, kind: str) -> None:
+    more = {"render": ("-o", "film.gif"), "clone": ("--name", "again")}.get(kind, ())
+    said = refusal(full, kind, "gone", *more)
+    assert "run gone: train.task: no task is called 'Vanished'; " in said
+    assert said.rstrip().endswith("(your own: module:Class; a plug-in's: install its package)")
+
+
+def test_a_plan_of_a_run_whose_task_is_not_installed_is_refused(full: Serving, tmp_path: Path) -> None:
+    spec = tmp_path / "judge.yaml"
+    spec.write_text(json.dumps({"name": "judge", "evaluate": {"run": "gone"}}))
+    for options in ([], ["--dry-run"]):
+        assert "run gone: train.task: no task is called 'Vanished'" in refusal(full, "submit", str(spec), *options)
 
 
 def test_a_job_from_yaml_is_checked_as_the_command_s_is(full: Serving, tmp_path: Path) -> None:

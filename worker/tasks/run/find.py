@@ -58,6 +58,8 @@ def find_task(name: str) -> type[Task]:
     try:
         with task_mistakes(name):
             module = importlib.import_module(module_name)
+    except SystemExit as error:  # else it would end who lists all tasks
+        raise ValueError(f"task {name!r}: {module_name} exits when it is imported (code {error.code})") from error
     except ModuleNotFoundError as error:
         if error.name is None or not (module_name == error.name or module_name.startswith(error.name + ".")):
             raise

@@ -178,6 +178,7 @@ class CarelessConfig(ReachConfig):
 def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An installed package with three tasks: one is fine, one's configuration can't be imported, one's has a defect."""
     (tmp_path / "reach_config.py").write_text(REACH)
+    (tmp_path / "reach_task.py").write_text("class Reach: ...\nclass Broken: ...\nclass Careless: ...\n")
     (tmp_path / "reach-1.0.dist-info").mkdir()
     (tmp_path / "reach-1.0.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: reach\nVersion: 1.0\n")
     (tmp_path / "reach-1.0.dist-info" / "entry_points.txt").write_text(
