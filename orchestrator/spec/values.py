@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import excerpt
+from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import nearest, shown
 from shared_store.volume.layout import NAME
 
@@ -77,7 +78,10 @@ def _job_name(value: str) -> str:
 
 
 def _task_name(value: str) -> str:
-    known = known_tasks()
+    points = entry_points(group="muster.tasks")
+    if words := clash(points, value):
+        raise ValueError(words)
+    known = sorted({point.name for point in points})
     if ":" in value or value in known:
         return value
     hint = nearest(value, known)
