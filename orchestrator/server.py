@@ -49,6 +49,7 @@ from orchestrator.persistence.urls import shown
 from orchestrator.plugins import add_plugins
 from orchestrator.services import arns
 from orchestrator.services.automatic_evaluations import AutomaticEvaluations
+from shared_store.contract.plugins import PluginError
 from shared_store.volume.layout import Store
 
 log = logging.getLogger("muster.controller")
@@ -177,10 +178,14 @@ class Server:
             )
             self.deliveries = Deliveries(self.controller, told, self.url)
             stack.callback(self.deliveries.close)
+            limit = RateLimit(rate_limit, submit_rate_limit)
+            self.app = create_app(self.controller, self.access, limit, self.deliveries)
+            try:
+                add_console(self.app)
+                add_plugins(self.app)
+            except PluginError as error:
+                raise ServerError(str(error)) from error
             self._opened = stack.pop_all()
-        self.app = create_app(self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries)
-        add_plugins(self.app)
-        add_console(self.app)
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(
             self.app,

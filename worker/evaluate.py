@@ -33,8 +33,7 @@ def main(kind: str = "evaluate") -> int:
     """
     stop = StopRequest().listen()  # before the imports, which take seconds
     job = Job.from_env(os.environ, kind)
-    run, section = job.named_run(), plugins.sections().get(kind)
-    rules: EvaluationRules | None = plugins.load(section.rules) if section else None
+    run, section, rules = job.named_run(), plugins.sections().get(kind), plugins.rules_of(kind)
     episodes = job.setting(*rules.count if rules else ("episodes", EPISODES))
     from worker.learning.distributed import REPORT_SECONDS, RankPlacement, connect, require_gpus, use_cpu_threads
 

@@ -14,13 +14,13 @@ from orchestrator.cli.misuse import Misuse, told
 from orchestrator.cli.terminal import echo, log_visibly, one_line
 from orchestrator.domain.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
 from shared_store import __version__
-from shared_store.contract.plugins import PluginError
+from shared_store.contract.plugins import PluginError, plugins
 from shared_store.volume.layout import StoreError
 
 try:
     from orchestrator.cli.catalogue import ENTRIES, Catalogue, add_placeholders
 except PluginError as error:  # before there is any command
-    sys.exit(f"muster: {error}")
+    sys.exit(f"muster: {one_line(str(error))}")
 
 app = typer.Typer(
     name="muster",
@@ -33,6 +33,12 @@ app = typer.Typer(
     epilog="Start with:  muster run job_specs/cartpole.yaml",
 )
 add_placeholders(app)
+
+_ADDED = [[command.name] for plugin in plugins().values() for command in plugin.commands]
+"""The commands of plug-ins, whose routes a controller may lack."""
+_NO_ROUTE = (
+    "the controller has no such plug-in: install its package where the controller runs, and start the controller again"
+)
 
 
 def _version(wanted: bool) -> None:
@@ -66,8 +72,10 @@ def main() -> None:
     except (SpecError, UsageError, NoUrl) as error:
         _fail(error, 2)
     except ApiError as error:
+        if error.status == 404 and str(error).endswith(": Not Found") and sys.argv[1:2] in _ADDED:
+            error = ApiError(f"{error}; {_NO_ROUTE}", 404)
         _fail(error, 2 if error.status in (400, 404) else 1)
-    except (Unreachable, ServerError, StoreError) as error:
+    except (Unreachable, ServerError, StoreError, PluginError) as error:
         _fail(error, 1)
     except KeyboardInterrupt:
         sys.exit(130)

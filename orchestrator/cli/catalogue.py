@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from typing import Any
@@ -13,7 +13,8 @@ import typer
 from typer.models import CommandInfo
 
 from orchestrator.cli.misuse import CommandGroup
-from shared_store.contract.plugins import Command, plugins
+from shared_store.contract.error_text import nearest
+from shared_store.contract.plugins import Command, PluginError, blamed, plugins
 from shared_store.contract.plugins import load as load_part
 
 
@@ -23,7 +24,7 @@ def _own(name: str, module: str, panel: str, summary: str) -> Command:
 
 
 _JOBS, _RUNS, _SHARED, _HERE = "Jobs", "Runs", "Controller", "This machine"
-ENTRIES = (
+_OWN = (
     _own(
         "run",
         "serving",
@@ -108,8 +109,25 @@ ENTRIES = (
         _HERE,
         "Check whether this machine meets Muster's requirements; exit 1 if a requested part is missing.",
     ),
-    *(command for plugin in plugins().values() for command in plugin.commands),
 )
+
+
+def _added() -> Iterator[Command]:
+    """The commands of plug-ins. Raises PluginError: one takes the name of Muster's, or adds options to a command that is not there."""
+    own = [entry.name for entry in _OWN]
+    for name, plugin in plugins().items():
+        for command in plugin.commands:
+            if command.name in own:
+                raise PluginError(
+                    f"plug-in {name}: commands: muster {command.name} is Muster's own; choose another name"
+                )
+        for extended, _ in plugin.options:
+            if extended not in own:
+                raise PluginError(f"plug-in {name}: options: there is no command {extended}; {nearest(extended, own)}")
+        yield from plugin.commands
+
+
+ENTRIES = (*_OWN, *_added())
 
 
 @dataclass(frozen=True)
@@ -126,7 +144,7 @@ class FurtherOptions:
     examples: str
 
     def extend(self, command: CommandInfo) -> None:
-        """Add the options to a command."""
+        """Add the options to a command. Raises ValueError where the command has one of this name."""
         own, function = command.callback, self.function
         assert own is not None
         first, second = (inspect.signature(each, eval_str=True) for each in (own, function))
@@ -147,11 +165,21 @@ _MODULES = {entry.name: entry.module for entry in ENTRIES}
 
 
 def load(name: str) -> Any:
-    """The command itself. Imports its module."""
-    own = typer.Typer(rich_markup_mode="rich")
-    import_module(_MODULES[name]).register(own)
+    """The command itself. Imports its module. Raises PluginError where it, or an option of it, is a plug-in's and can't be used."""
+    own, module = typer.Typer(rich_markup_mode="rich"), _MODULES[name]
+    if any(entry.name == name for entry in _OWN):
+        import_module(module).register(own)
+    else:
+        register = load_part(f"{module}:register", Callable)
+        with blamed(module):
+            register(own)
+            if name not in (made := typer.main.get_group(own).commands):
+                raise ValueError(f"it registers {', '.join(made) or 'no command'}, and not {name}")
     for place in (place for plugin in plugins().values() for extended, place in plugin.options if extended == name):
-        load_part(place).extend(own.registered_commands[0])
+        further = load_part(place, FurtherOptions)
+        with blamed(place):
+            further.extend(own.registered_commands[0])
+            typer.main.get_group(own)
     command: Any = typer.main.get_group(own).commands[name]
     for each in (command, *getattr(command, "commands", {}).values()):
         # a docstring's line breaks are the source's; the terminal's width decides on its own

@@ -39,7 +39,7 @@ from importlib import import_module
 
 from fastapi import FastAPI
 
-from orchestrator.console import assets, routing
+from orchestrator.console import assets, routing, submit_fields
 
 PAGES = (
     "login",
@@ -61,7 +61,11 @@ PAGES = (
 
 
 def add_console(app: FastAPI) -> None:
-    """Add the pages to the application that :func:`orchestrator.api.http.app.create_app` made."""
+    """Add the pages to the application that :func:`orchestrator.api.http.app.create_app` made.
+
+    Raises PluginError: a plug-in's part of the wizard can't be used.
+    """
+    submit_fields.forms()
     app.include_router(assets.router)
     for name in PAGES:
         app.include_router(import_module(f"{__name__}.{name}").router)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,7 @@ from orchestrator.console import assets
 from orchestrator.console import formats as words
 from orchestrator.services.permissions import Actor
 from shared_store import __version__
-from shared_store.contract.plugins import plugins
+from shared_store.contract.plugins import PluginError, load, plugins
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; frame-src 'self'; "
@@ -40,7 +38,7 @@ THEME = "muster-theme"
 
 @dataclass(frozen=True)
 class NavigationEntry:
-    """An entry of the navigation; shown once its page exists."""
+    """An entry of the navigation."""
 
     label: str
     path: str
@@ -57,15 +55,27 @@ NAVIGATION = (
 )
 
 
-def _added_templates() -> Iterator[Path]:
-    """The folders of plug-ins' templates."""
-    for package in (plugin.templates for plugin in plugins().values() if plugin.templates):
-        for place in import_module(package).__path__:
-            yield Path(place) / "templates"
+def _template_folders() -> list[Path]:
+    """The folder of the console's templates, and those of plug-ins. Raises PluginError: one is not there, or hides another's template."""
+    found, owners = [Path(__file__).parent / "templates"], dict[str, str]()
+    for name, package in ((name, plugin.templates) for name, plugin in plugins().items() if plugin.templates):
+        there = [Path(place) / "templates" for place in getattr(load(package), "__path__", ())]
+        if not any(folder.is_dir() for folder in there):
+            raise PluginError(f"plug-in {name}: templates: package {package} has no folder templates; install it again")
+        found += there
+    for folder in found:
+        for template in sorted(folder.glob("**/*.html")):
+            key = str(template.relative_to(folder))
+            if key in owners:
+                raise PluginError(
+                    f"plug-in: the template {key} is in {owners[key]} and in {folder}; one of them needs another name"
+                )
+            owners[key] = str(folder)
+    return found
 
 
 templates = Environment(
-    loader=FileSystemLoader([Path(__file__).parent / "templates", *_added_templates()]),
+    loader=FileSystemLoader(_template_folders()),
     autoescape=select_autoescape(default=True, default_for_string=True),
     undefined=StrictUndefined,
     trim_blocks=True,
@@ -124,13 +134,12 @@ def session(request: Request) -> str:
 
 
 def _navigation(request: Request) -> list[NavigationEntry]:
-    """The pages that are there, without those that would be refused."""
+    """The entries, without those whose pages would be refused."""
     actor = actor_of(request)
     refused = set() if may_change(actor) else {"/submit"}
     if actor.queues is not None:
         refused.add("/keys")
-    there: set[str] = request.app.state.console_paths
-    return [entry for entry in NAVIGATION if entry.path in there - refused]
+    return [entry for entry in NAVIGATION if entry.path not in refused]
 
 
 def wants_page(request: Request) -> bool:

@@ -10,14 +10,14 @@ from fastapi import APIRouter, Depends, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
-from starlette.routing import Match
 
 from orchestrator.api.http.auth import kind_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.console.forms import Unconfirmed, check_form
-from orchestrator.console.pages import NAVIGATION, failure, wants_page
+from orchestrator.console.pages import failure, wants_page
 from orchestrator.domain.errors import ClientError, Unavailable
 from shared_store.contract.error_text import explain
+from shared_store.contract.plugins import PluginError
 from shared_store.volume.files import DamagedFile
 
 
@@ -40,6 +40,8 @@ class PageRoute(APIRoute):
                 return failure(request, f"{name}: {explain(first)}", 400)
             except Unavailable as error:
                 return failure(request, str(error), 503, "ServerException")
+            except PluginError as error:
+                return failure(request, str(error), 500, "ServerException")
             except DamagedFile as error:
                 return failure(request, f"the store holds a damaged file: {error}", 409)
 
@@ -69,10 +71,7 @@ def page_router(*repeatable: str, stored: bool = False) -> APIRouter:
 
 
 def finish(app: FastAPI) -> None:
-    """Call after the last page was added: note the pages for the navigation, and answer browsers with a page at unknown addresses."""
-    app.state.console_paths = {
-        each.path for each in NAVIGATION if any(_leads(route, each.path) for route in app.routes)
-    }
+    """Answer browsers with a page at unknown addresses."""
     before: Any = app.exception_handlers[HTTPException]
 
     async def not_found(request: Request, error: Exception) -> Response:
@@ -83,8 +82,3 @@ def finish(app: FastAPI) -> None:
         return answer
 
     app.add_exception_handler(HTTPException, not_found)
-
-
-def _leads(route: Any, path: str) -> bool:
-    scope = {"type": "http", "method": "GET", "path": path, "root_path": "", "path_params": {}, "headers": []}
-    return bool(route.matches(scope)[0] is Match.FULL)

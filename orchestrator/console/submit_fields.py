@@ -94,8 +94,8 @@ def form_of(task: str) -> TaskForm | None:
 
 @cache
 def forms() -> Sequence[TaskForm]:
-    """Those of all plug-ins."""
-    return [load(place) for plugin in plugins().values() for place in plugin.forms]
+    """Those of all plug-ins. Raises PluginError."""
+    return [load(place, TaskForm) for plugin in plugins().values() for place in plugin.forms]
 
 
 @cache

@@ -8,6 +8,7 @@ from importlib.metadata import EntryPoint, entry_points
 
 from orchestrator.engines.api import Engine, EngineError, EngineType, Option, Setting, Traits
 from orchestrator.engines.toolkit.looks import observing_several
+from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import nearest
 
 GROUP = "muster.engines"
@@ -37,10 +38,12 @@ ENGINES = tuple(_POINTS)
 
 @cache
 def engine_type(name: str) -> EngineType:
-    """The engine's type. Raises EngineError where there is none of this name, or it can't be imported."""
+    """The engine's type. Raises EngineError where there is none of this name, two packages give it, or it can't be imported."""
     if name not in _POINTS:
         there = ", ".join(ENGINES) or "none: install Muster again (pip install -e .)"
         raise EngineError(f"there is no engine {name!r}; there are {there}")
+    if words := clash(entry_points(group=GROUP), name):
+        raise EngineError(f"engine {name}: {words}")
     try:
         found = _POINTS[name].load()
     except (ImportError, AttributeError) as error:

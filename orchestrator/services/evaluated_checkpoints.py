@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.chosen_checkpoints import choose, refusal
@@ -15,9 +15,6 @@ from shared_store.contract import plugins
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.run_settings import merged
-
-if TYPE_CHECKING:
-    from shared_store.contract.plugins import EvaluationRules
 
 
 def check_task(run: Run) -> None:
@@ -56,8 +53,7 @@ def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str =
     task, trained = facts.get("task"), facts.get("train")
     kind = task_config(task) if isinstance(task, str) else None
     before = trained.get("config") if isinstance(trained, dict) else None
-    added = plugins.sections().get(key)
-    rules: EvaluationRules | None = plugins.load(added.rules) if added else None
+    rules = plugins.rules_of(key)
     if rules:
         if kind is not None and (words := rules.refusal(kind)):
             raise ClientError(f"{key}: run {run.name} trained {task}, {words}")

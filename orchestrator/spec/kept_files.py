@@ -157,8 +157,8 @@ def _with_text(value: Any, field: str, text_of: TextOf, note: Note | None) -> An
 
 def _whole(section: str, values: Mapping[str, Any], base: Mapping[str, Any] | None) -> Mapping[str, Any]:
     """The configuration of a section, as far as it is known."""
-    added = plugins.sections().get(section)
-    changes = plugins.load(added.rules).changes(values) if added else values.get("config") or {}
+    rules = plugins.rules_of(section)
+    changes = rules.changes(values) if rules else values.get("config") or {}
     return {**(base or {}), **changes}
 
 

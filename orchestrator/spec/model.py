@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
+from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
@@ -50,6 +51,7 @@ from orchestrator.spec.values import (
     place_of,
 )
 from shared_store.contract import plugins
+from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import OF_PLUGIN, Refused, explain, kind_of, nearest, path_of, shown
 from shared_store.volume.texts import beside
 
@@ -62,6 +64,8 @@ ALGORITHMS = settings_classes()
 
 
 def _algorithm_name(value: str) -> str:
+    if words := clash(entry_points(group="muster.algorithms"), value):
+        raise ValueError(words)
     known = list(ALGORITHMS)
     if value in known or re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", value):
         return value
@@ -271,10 +275,22 @@ class _Spec(Section):
         return max(1, self.resources.gpus)
 
 
+def _section_model(section: plugins.JobSection) -> type[OfCheckpoint]:
+    """The model of a plug-in's section. Raises PluginError: it can't be imported, or its key is there already."""
+    model: type[OfCheckpoint] = plugins.load(section.model, type)
+    if not issubclass(model, OfCheckpoint):
+        raise plugins.failed(section.model, TypeError("it is no orchestrator.spec.sections.OfCheckpoint"))
+    if section.key in _Spec.model_fields:
+        raise plugins.failed(
+            section.model, ValueError(f"{section.key} is a key of every job; choose another for the section")
+        )
+    return model
+
+
 if TYPE_CHECKING:
     Spec = _Spec
 else:
-    _added = {key: (plugins.load(section.model) | None, None) for key, section in plugins.sections().items()}
+    _added = {key: (_section_model(section) | None, None) for key, section in plugins.sections().items()}
     Spec = create_model("Spec", __base__=_Spec, __doc__=_Spec.__doc__, **_added)
 
 

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.spec.task_modules import module_problem
+from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import shown, unknown_task
 from shared_store.volume.layout import NAME
 
@@ -78,8 +79,14 @@ def _job_name(value: str) -> str:
 
 
 def task_name(value: str) -> str:
-    """The name of an installed task, or ``module:Class``. Raises ValueError for another, and where the task can't be imported."""
-    places = {point.name: point.value for point in entry_points(group="muster.tasks")}
+    """The name of an installed task, or ``module:Class``.
+
+    Raises ValueError for another, where two packages have one of this name, and where the task can't be imported.
+    """
+    points = entry_points(group="muster.tasks")
+    if words := clash(points, value):
+        raise ValueError(words)
+    places = {point.name: point.value for point in points}
     if ":" in value:
         return value
     if value not in places:

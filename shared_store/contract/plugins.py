@@ -7,14 +7,17 @@ no route. docs/plug-ins.md shows one, and the modules that it may import.
 from __future__ import annotations
 
 import os
+import re
 import sys
-from dataclasses import dataclass
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, is_dataclass
 from functools import cache
 from importlib import import_module
 
 TYPE_CHECKING = False  # the command reads this module for `muster --help`
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator
     from typing import Any, Protocol
 
     class EvaluationRules(Protocol):
@@ -37,10 +40,59 @@ if TYPE_CHECKING:
 
 
 GROUP = "muster.plugins"
+OF_STORE = frozenset({"runs", "models", "texts", "trash", "controllers", "code"})
+"""Folders that Muster itself has in the store."""
+OF_RUN = frozenset(
+    {
+        *("checkpoints", "metrics", "evaluations", "exports", "recordings", "telemetry", "tracking", "texts", "logs"),
+        *("outcomes", "parent", "teachers", "incidents", "replays", "EPOCH"),
+    }
+)
+"""What Muster itself has in a run, beside files with a suffix."""
 
 
 class PluginError(Exception):
     """A plug-in can't be used; one line."""
+
+
+_Form = tuple[re.Pattern[str], str]
+"""What a text of a declaration has to match, and that in words."""
+_DOTTED = r"[^\W\d]\w*(\.[^\W\d]\w*)*"
+_TEXT: _Form = re.compile(r"\S.*"), "a line of text"
+_NAME: _Form = re.compile(r"[a-z][a-z0-9-]*"), "a name of lower-case letters, digits and '-'"
+_KEY: _Form = re.compile(r"[a-z][a-z0-9_]*"), "a key of lower-case letters, digits and '_'"
+_MODULE: _Form = re.compile(_DOTTED), "a module, such as package.module"
+_PLACE: _Form = re.compile(f"{_DOTTED}:{_DOTTED}"), "module:name"
+_PATH: _Form = re.compile(r"/\S*"), "a path that begins with /"
+_OPERATION: _Form = (
+    re.compile(r"(GET|POST|PUT|PATCH|DELETE) /\S*"),
+    "METHOD /path, such as GET /api/notes",
+)
+_FOLDER: _Form = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*"), "the name of a folder, of letters, digits, '_' and '-'"
+
+
+def _check(where: str, value: object, form: _Form) -> None:
+    """Raises PluginError for anything but a text of this form."""
+    if not isinstance(value, str) or not form[0].fullmatch(value):
+        raise PluginError(f"{where}: expected {form[1]}, found {value!r:.80}")
+
+
+def _check_each(where: str, values: object, *forms: _Form) -> None:
+    """Raises PluginError for anything but a tuple of texts, or of tuples with a text of each form."""
+    for value in _tuple(where, values):
+        if len(forms) == 1:
+            _check(where, value, forms[0])
+        elif not isinstance(value, tuple) or len(value) != len(forms):
+            raise PluginError(f"{where}: expected tuples of {len(forms)} texts, found {value!r:.80}")
+        else:
+            for text, form in zip(value, forms, strict=True):
+                _check(where, text, form)
+
+
+def _tuple(where: str, values: object) -> tuple[object, ...]:
+    if not isinstance(values, tuple):
+        raise PluginError(f"{where}: expected a tuple, found {values!r:.80}")
+    return values
 
 
 @dataclass(frozen=True)
@@ -58,6 +110,11 @@ class Command:
     module: str
     panel: str
     summary: str
+
+    def __post_init__(self) -> None:
+        """Raises PluginError for a field of another form."""
+        for field, form in (("name", _NAME), ("module", _MODULE), ("panel", _TEXT), ("summary", _TEXT)):
+            _check(f"Command.{field}", getattr(self, field), form)
 
 
 @dataclass(frozen=True)
@@ -79,6 +136,14 @@ class JobSection:
     rank: str
     rules: str
     watcher: str
+
+    def __post_init__(self) -> None:
+        """Raises PluginError for a field of another form."""
+        _check("JobSection.key", self.key, _KEY)
+        _check("JobSection.verb", self.verb, _TEXT)
+        _check("JobSection.rank", self.rank, _MODULE)
+        for field in ("model", "rules", "watcher"):
+            _check(f"JobSection.{field}", getattr(self, field), _PLACE)
 
 
 @dataclass(frozen=True)
@@ -116,28 +181,142 @@ class Plugin:
     references: str = ""
     bundle_parts: str = ""
 
+    def __post_init__(self) -> None:
+        """Raises PluginError for a field of another form, and for a folder that is Muster's own."""
+        _check_each("operations", self.operations, _OPERATION)
+        for field in ("routers", "pages", "forms"):
+            _check_each(field, getattr(self, field), _PLACE)
+        _check_each("navigation", self.navigation, _TEXT, _PATH)
+        _check_each("options", self.options, _NAME, _PLACE)
+        for field, kind in (("commands", Command), ("sections", JobSection)):
+            if odd := [each for each in _tuple(field, getattr(self, field)) if not isinstance(each, kind)]:
+                raise PluginError(f"{field}: expected {kind.__name__}(…), found {odd[0]!r:.80}")
+        for field, own in (("folders", OF_STORE), ("run_folders", OF_RUN)):
+            _check_each(field, getattr(self, field), _FOLDER)
+            if taken := sorted(own.intersection(getattr(self, field))):
+                raise PluginError(f"{field}: {taken[0]} is a folder of Muster's own; choose another name")
+        for field, form in (("templates", _MODULE), ("references", _PLACE), ("bundle_parts", _PLACE)):
+            if getattr(self, field) != "":
+                _check(field, getattr(self, field), form)
 
-def load(place: str) -> Any:
-    """What ``module:name`` names. Raises PluginError where it can't be imported."""
+
+def load(place: str, kind: Any = object) -> Any:
+    """What ``module:name`` of a plug-in's declaration names, or the module where it is one.
+
+    Raises PluginError, which names the plug-in and the field: it can't be imported, or is no ``kind``.
+    """
+    try:
+        found = _imported(place)
+    except PluginError as error:
+        raise PluginError(f"{_declared_in(place)}: {error}") from error
+    if not isinstance(found, kind):
+        raise PluginError(f"{_declared_in(place)}: {place} is {type(found).__name__}, and no {kind.__name__}")
+    return found
+
+
+@contextmanager
+def blamed(place: str) -> Iterator[None]:
+    """A context in which a plug-in's part is called. Raises PluginError, which names the plug-in, for any error of its code."""
+    try:
+        yield
+    except PluginError:
+        raise
+    except Exception as error:  # of somebody's code, which may do anything
+        raise failed(place, error) from error
+
+
+def failed(place: str, error: BaseException) -> PluginError:
+    """The error of a plug-in's part that raised another one than it may."""
+    return PluginError(
+        f"{_declared_in(place)}: {place} failed ({_words(error)}); tell the plug-in's author, or remove it"
+    )
+
+
+def _imported(place: str) -> Any:
     module, _, name = place.partition(":")
     try:
-        return getattr(import_module(module), name)
-    except Exception as error:  # of somebody's code, which may do anything
+        found = import_module(module)
+        for each in filter(None, name.split(".")):
+            found = getattr(found, each)
+    except PluginError:  # of a declaration, which the module makes
+        raise
+    except (Exception, SystemExit) as error:  # of somebody's code, which may do anything
         raise PluginError(
-            f"plug-in: {place} can't be imported ({error}); install its package again, or remove it"
+            f"{place} can't be imported ({_words(error)}); install its package again, or remove it"
         ) from error
+    return found
+
+
+def _words(error: BaseException) -> str:
+    """An error in one line."""
+    if isinstance(error, SystemExit):
+        return f"it exits with {error.code!r:.80}"
+    return " ".join(str(error).split())[:300] or type(error).__name__
+
+
+def _declared_in(place: str) -> str:
+    """The plug-in and the field that name a part, for errors."""
+    for name, plugin in plugins().items():
+        for field, value in vars(plugin).items():
+            if any(place in (text, f"{text}:register") for text in _texts(value)):
+                return f"plug-in {name}: {field}"
+    return "plug-in"
+
+
+def _texts(value: object) -> Iterator[str]:
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, tuple):
+        for each in value:
+            yield from _texts(each)
+    elif is_dataclass(value):
+        yield from _texts(tuple(vars(value).values()))
 
 
 @cache
 def plugins() -> Mapping[str, Plugin]:
-    """The plug-ins of all installed packages, by their names. Raises PluginError."""
-    found = {name: load(place) for name, place in sorted(_places())}
+    """The plug-ins of all installed packages, by their names.
+
+    Raises PluginError: one can't be imported, declares something of another form, or two of them have the same name, folder, command,
+    or key of a section.
+    """
+    found: dict[str, Plugin] = {}
+    owners: dict[str, str] = {}
+    for name, place, package in sorted(_places()):
+        if name in found:
+            raise PluginError(f"plug-in {name}: {_both(owners[name], package)} bring one of this name; {_REMEDY}")
+        try:
+            _check("its entry point", place, _PLACE)
+            plugin = _imported(place)
+            if not isinstance(plugin, Plugin):
+                raise PluginError(f"{place} is no Plugin of {__name__}")
+        except PluginError as error:
+            raise PluginError(f"plug-in {name} of the package {package}: {error}") from error
+        found[name], owners[name] = plugin, package
+    taken: dict[tuple[str, str], str] = {}
     for name, plugin in found.items():
-        if not isinstance(plugin, Plugin):
-            raise PluginError(
-                f"plug-in {name}: its entry point is no Plugin of {__name__}; install another version of it"
-            )
+        for each in _names(plugin):
+            if each in taken:
+                raise PluginError(
+                    f"plug-in {name}: the {' '.join(each)} is there twice, in {_both(owners[taken[each]], owners[name])}; {_REMEDY}"
+                )
+            taken[each] = name
     return found
+
+
+_REMEDY = "remove one of them (pip uninstall)"
+
+
+def _both(one: str, other: str) -> str:
+    return f"the packages {one} and {other}" if one != other else f"the package {one}"
+
+
+def _names(plugin: Plugin) -> Iterator[tuple[str, str]]:
+    """The names that no two plug-ins may share, with what they are."""
+    yield from (("folder", each) for each in plugin.folders)
+    yield from (("folder of runs", each) for each in plugin.run_folders)
+    yield from (("command", each.name) for each in plugin.commands)
+    yield from (("section", each.key) for each in plugin.sections)
 
 
 @cache
@@ -146,24 +325,41 @@ def sections() -> Mapping[str, JobSection]:
     return {section.key: section for plugin in plugins().values() for section in plugin.sections}
 
 
+def rules_of(key: str) -> EvaluationRules | None:
+    """The rules by which a section evaluates; None of one that is no plug-in's. Raises PluginError."""
+    if (section := sections().get(key)) is None:
+        return None
+    rules: EvaluationRules = load(section.rules)
+    if missing := [each for each in ("count", "refusal", "changes", "key_of", "lines") if not hasattr(rules, each)]:
+        raise PluginError(
+            f"{_declared_in(section.rules)}: {section.rules} is no EvaluationRules: it has no {missing[0]}"
+        )
+    return rules
+
+
 def evaluating() -> tuple[str, ...]:
     """The keys of all kinds of jobs that evaluate a checkpoint. Raises PluginError."""
     return ("evaluate", *sections())
 
 
-def _places() -> set[tuple[str, str]]:
-    """Name and place of each plug-in. importlib.metadata has them, too, but its import takes a seventh of ``muster --help``."""
-    found: dict[str, str] = {}
+def _places() -> Iterator[tuple[str, str, str]]:
+    """Name, place and package of each plug-in. importlib.metadata has them, too, but its import takes a seventh of ``muster --help``.
+
+    As there, of two copies of a package the one counts that comes first on the path.
+    """
+    seen: set[str] = set()
     for folder in sys.path:
         try:
-            entries = os.listdir(folder or ".")
+            entries = sorted(os.listdir(folder or "."))
         except OSError:
             continue
         for entry in entries:
             if entry.endswith((".dist-info", ".egg-info")):
-                for name, place in _declared(os.path.join(folder, entry, "entry_points.txt")):
-                    found.setdefault(name, place)
-    return set(found.items())
+                package = re.sub(r"[-_.]+", "-", entry.rpartition(".")[0].partition("-")[0]).lower()
+                if package not in seen:
+                    seen.add(package)
+                    for name, place in _declared(os.path.join(folder, entry, "entry_points.txt")):
+                        yield name, place, package
 
 
 def _declared(path: str) -> Iterator[tuple[str, str]]:
@@ -171,11 +367,12 @@ def _declared(path: str) -> Iterator[tuple[str, str]]:
     try:
         with open(path, encoding="utf-8") as file:
             text = file.read()
-    except OSError:
+    except (OSError, ValueError):
         return
-    if GROUP in text:
-        _, _, rest = text.partition(f"[{GROUP}]")
-        for line in rest.partition("\n[")[0].splitlines():
-            name, separator, place = line.partition("=")
-            if separator:
-                yield name.strip(), place.strip()
+    group = ""
+    for line in map(str.strip, text.splitlines() if GROUP in text else ()):
+        name, separator, place = line.partition("=")
+        if line.startswith("["):
+            group = line.strip("[]").strip()
+        elif group == GROUP and separator and not line.startswith(("#", ";")):
+            yield name.strip(), place.partition("[")[0].strip()

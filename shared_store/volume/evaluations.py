@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from shared_store.contract.error_text import counted
-from shared_store.contract.plugins import load, sections
+from shared_store.contract.plugins import rules_of, sections
 from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_atomic
 from shared_store.volume.layout import LARGEST_DESCRIPTION, Run
 from shared_store.volume.metrics import finite
@@ -126,8 +126,8 @@ def kind_of(summary: Mapping[str, Any]) -> str:
 
 def lines(summary: Mapping[str, Any]) -> Iterator[str]:
     """An evaluation as lines of text."""
-    if section := sections().get(kind_of(summary)):
-        yield from load(section.rules).lines(summary)
+    if rules := rules_of(kind_of(summary)):
+        yield from rules.lines(summary)
         return
     task, seed = summary.get("task"), summary.get("seed")
     yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from shared_store.contract.plugins import load, plugins
+from shared_store.contract.plugins import PluginError, failed, load, plugins
 from shared_store.volume import models
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile, is_there, read_json
@@ -34,6 +35,7 @@ class Unreadable(NamedTuple):
 
 
 Found = Iterator[Needed | Unreadable]
+_READING = (DamagedBundle, DamagedFile, ModelError, OSError)
 
 
 def references(store: Store) -> tuple[list[Needed], list[Unreadable]]:
@@ -52,7 +54,9 @@ def read(what: str, referrer: Callable[..., Found], *arguments: Any) -> Found:
         yield from referrer(*arguments)
     except DamagedBundle as error:  # which names the model
         yield Unreadable(str(error))
-    except (DamagedFile, ModelError, OSError) as error:
+    except PluginError as error:  # which names the plug-in
+        yield Unreadable(str(error))
+    except _READING as error:
         yield Unreadable(f"{what} can't be read ({error})")
 
 
@@ -99,7 +103,21 @@ def _of_plugins() -> Iterator[tuple[str, Callable[[Store], Found]]]:
     yield "plugins.json", _of_orphans
     for name, plugin in plugins().items():
         if plugin.references:
-            yield name, load(plugin.references)
+            yield f"plug-in {name}", partial(_of_plugin, plugin.references)
+
+
+def _of_plugin(place: str, store: Store) -> Found:
+    """What a plug-in's folders need. Raises PluginError: its function can't be imported, fails, or yields something else."""
+    function = load(place, Callable)
+    try:
+        for each in function(store):
+            if not isinstance(each, Needed | Unreadable):
+                raise TypeError(f"it yields {each!r:.80}, which is neither Needed nor Unreadable")
+            yield each
+    except _READING:
+        raise
+    except Exception as error:  # of somebody's code, which may do anything
+        raise failed(place, error) from error
 
 
 def part(value: Any, key: str) -> Any:

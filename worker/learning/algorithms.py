@@ -17,20 +17,22 @@ import torch
 from pydantic import ValidationError
 from pydantic_core import ArgsKwargs
 
+from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import explain, nearest, path_of, shown
 from worker.learning.algorithm import Algorithm
 from worker.settings.errors import UserError
 from worker.settings.task import TaskConfig
 
 DEFAULT = "ppo"
+_GROUP = "muster.algorithms"
 
 
 def installed() -> dict[str, str]:
     """The class (``module:Class``) of each installed algorithm, by name, from the entry points ``muster.algorithms``."""
-    found = {point.name: point.value for point in entry_points(group="muster.algorithms")}
+    found = {point.name: point.value for point in entry_points(group=_GROUP)}
     source = Path(__file__).parents[2] / "pyproject.toml"
     if not found and source.exists():  # a source tree on the path, not installed
-        found = tomllib.loads(source.read_text())["project"]["entry-points"]["muster.algorithms"]
+        found = tomllib.loads(source.read_text())["project"]["entry-points"][_GROUP]
     return found
 
 
@@ -40,11 +42,13 @@ def section_of(name: str) -> str:
 
 
 def find_algorithm(name: str) -> type[Algorithm]:
-    """The class of an algorithm. Raises UserError for an unknown name.
+    """The class of an algorithm. Raises UserError for an unknown name, and for one that two packages give.
 
     Args:
         name: One of :func:`installed`, or ``module:Class`` of a user's own, importable from the job's directory.
     """
+    if words := clash(entry_points(group=_GROUP), name):
+        raise UserError(f"train.algorithm: {words}")
     known = installed()
     place = name if ":" in name else known.get(name, "")
     module, _, attribute = place.partition(":")

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from shared_store.contract.error_text import kind_of
 from shared_store.contract.faults import fault_in
+from shared_store.contract.plugins import PluginError
 from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.volume.epoch import StaleEpoch
 from shared_store.volume.layout import Run, Store, StoreError
@@ -205,7 +206,7 @@ def run_command(body: Callable[[], int]) -> None:
     gc.disable()
     try:
         code = body()
-    except (UserError, StoreError) as error:
+    except (UserError, StoreError, PluginError) as error:
         print(getattr(error.__cause__, "trace", ""), end="", file=sys.stderr, flush=True)  # of a TaskMistake
         code = _fail(str(error), EX_USAGE)
     except (GangError, TrainingError, StaleEpoch, DamagedCheckpoint) as error:

@@ -27,6 +27,7 @@ from orchestrator.control.deliveries import Deliveries
 from orchestrator.domain.errors import ClientError, RequestError, Unavailable
 from orchestrator.services.permissions import Operation
 from shared_store import __version__
+from shared_store.contract.plugins import PluginError
 from shared_store.volume.files import DamagedFile
 
 BROWSER_HEADERS = [
@@ -57,6 +58,7 @@ def create_app(
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(DataError, _refused_by_database)
     app.add_exception_handler(Unavailable, _unavailable)
+    app.add_exception_handler(PluginError, _broken_plugin)
     app.add_exception_handler(DamagedFile, _damaged_file)
 
     @app.get("/healthz")
@@ -145,6 +147,10 @@ async def _refused_by_database(request: Request, error: Exception) -> JSONRespon
 async def _damaged_file(request: Request, error: Exception) -> JSONResponse:
     """Files on the volume are written by jobs and may hold anything: that is no error of the server."""
     return error_response(f"the store holds a damaged file: {error}", 409)
+
+
+async def _broken_plugin(request: Request, error: Exception) -> JSONResponse:
+    return error_response(str(error), 500, "ServerException")
 
 
 async def _unavailable(request: Request, error: Exception) -> JSONResponse:

@@ -16,6 +16,7 @@ import pytest
 from shared_store.volume.layout import Store
 from shared_store.volume.references import Needed, references
 from tests.conftest import REPOSITORY, Serving, run_muster
+from tests.support.plugin_packages import write_package
 
 JOB = "name: noted\nresources: {cpus: 0.1, memory: 16MiB}\ncommand: ['true']\n"
 
@@ -95,10 +96,119 @@ print(json.dumps([task.__name__, load(plugins()["notes"].bundle_parts)(task.__ne
     assert json.loads(told.splitlines()[-1]) == ["ShortCartpole", {"notes.json": {"task": "ShortCartpole"}}]
 
 
+def test_a_controller_that_started_before_the_plug_in_was_installed_is_to_be_started_again(
+    installed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    with Serving(tmp_path, "--cpus", "1"):
+        done = run_muster("notes", home=tmp_path, PYTHONPATH=str(installed))
+    assert (done.returncode, done.stderr) == (
+        2,
+        "muster: GET /api/notes: Not Found; the controller has no such plug-in: install its package where the controller runs, and "
+        "start the controller again\n",
+    )
+
+
+COMMAND = "commands=(Command('tally', 'tally_parts', 'Runs', 'Count.'),)"
+SECTION = "JobSection('{}', 'counts', 'tally_parts:{}', 'tally_parts', 'tally_parts:RULES', 'tally_parts:Watcher')"
+OTHER = "def register(app):\n    app.command('score')(print_it)\ndef print_it() -> None:\n    pass\n"
+UNREADABLE = "def register(app):\n    app.command('tally')(print_it)\ndef print_it(x: 'nowhere') -> None:\n    pass\n"
+BROKEN = {
+    "Command('list', 'tally_parts', 'Runs', 'Count.')": ("--help", "", "commands: muster list is Muster's own"),
+    COMMAND.replace("tally_parts", "nowhere"): ("tally", "", "commands: nowhere:register can't be imported (No module"),
+    f"{COMMAND} ": ("tally", "1 / 0", "commands: tally_parts:register can't be imported (division by zero)"),
+    f"{COMMAND}  ": ("tally", "", "commands: tally_parts:register can't be imported (module 'tally_parts' has no"),
+    f"{COMMAND}   ": ("tally", "register = 3", "commands: tally_parts:register is int, and no Callable"),
+    f"{COMMAND}    ": ("tally", OTHER, "commands: tally_parts failed (it registers score, and not tally)"),
+    f"{COMMAND}     ": ("tally --help", UNREADABLE, "commands: tally_parts failed (name 'nowhere' is not defined)"),
+    "options=(('evalute', 'tally_parts:MORE'),)": (
+        "--help",
+        "",
+        "options: there is no command evalute; did you mean e",
+    ),
+    "options=(('evaluate', 'tally_parts:MORE'),)": (
+        "evaluate --help",
+        "",
+        "options: tally_parts:MORE can't be imported",
+    ),
+    "options=(('evaluate', 'tally_parts:MORE'),) ": (
+        "evaluate --help",
+        "MORE = 3",
+        "options: tally_parts:MORE is int, and",
+    ),
+    "templates='nowhere'": ("serve", "", "templates: nowhere can't be imported (No module named 'nowhere')"),
+    "templates='tally'": ("serve", "", "templates: package tally has no folder templates; install it again"),
+    "routers=('tally_parts:router',)": ("serve", "", "routers: tally_parts:router can't be imported"),
+    "pages=('tally_parts:pages',)": (
+        "run JOB",
+        "1 / 0",
+        "pages: tally_parts:pages can't be imported (division by zero)",
+    ),
+    "forms=('tally_parts:FORM',)": ("serve", "FORM = 3", "forms: tally_parts:FORM is int, and no TaskForm"),
+    f"sections=({SECTION.format('tally', 'Tally')},)": ("serve", "", "sections: tally_parts:Tally can't be imported"),
+    f"sections=({SECTION.format('tally', 'Tally')},) ": (
+        "run JOB",
+        "class Tally: pass",
+        "sections: tally_parts:Tally failed",
+    ),
+    f"sections=({SECTION.format('queue', 'Tally')},)": (
+        "schema",
+        "from orchestrator.spec.sections import OfCheckpoint as Tally",
+        "sections: tally_parts:Tally failed (queue is a key of every job",
+    ),
+}
+"""Declarations (with spaces, to be told apart): a command that uses the part, the module of the parts, and the error."""
+
+
+@pytest.mark.parametrize("declaration", BROKEN)
+def test_a_part_that_can_t_be_used_ends_a_command_with_one_line_that_names_the_plug_in(
+    tmp_path: Path, declaration: str
+) -> None:
+    command, code, words = BROKEN[declaration]
+    declaration = f"commands=({declaration},)" if declaration.startswith("Command") else declaration
+    write_package(tmp_path, "tally", f"Plugin({declaration})", code)
+    (tmp_path / "job.yaml").write_text(JOB)
+    arguments = command.replace("JOB", str(tmp_path / "job.yaml")).split()
+    done = run_muster(*arguments, home=tmp_path, PYTHONPATH=str(tmp_path))
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
+    assert done.stderr.startswith(f"muster: plug-in tally: {words}")
+
+
+def test_a_rank_ends_with_one_line_where_a_part_can_t_be_used(tmp_path: Path) -> None:
+    write_package(tmp_path, "tally", "Plugin(bundle_parts='tally_parts:parts')", "1 / 0")
+    code = "from worker.learning.job import run_command\nfrom shared_store.contract.plugins import load, plugins\n"
+    code += "run_command(lambda: load(plugins()['tally'].bundle_parts))"
+    env = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (
+        2,
+        "error: plug-in tally: bundle_parts: tally_parts:parts can't be imported (division by zero); install its package again, "
+        "or remove it\n",
+    )
+
+
+@pytest.mark.parametrize(
+    ("group", "name", "arguments"),
+    [
+        ("muster.tasks", "Cartpole", ("submit", "--dry-run", "job_specs/cartpole.yaml")),
+        ("muster.tasks", "Cartpole", ("tasks", "Cartpole")),
+        ("muster.algorithms", "ppo", ("submit", "job_specs/cartpole.yaml", "--set", "train.algorithm=ppo")),
+        ("muster.engines", "local", ("serve",)),
+    ],
+)
+def test_a_name_that_two_packages_give_means_neither(
+    tmp_path: Path, group: str, name: str, arguments: tuple[str, ...]
+) -> None:
+    write_package(tmp_path, name, "None", module="tally", group=group)
+    done = run_muster(*arguments, home=tmp_path, PYTHONPATH=str(tmp_path))
+    assert done.returncode in (1, 2) and done.stderr.count("\n") == 1, done.stderr
+    assert f"the name {name} is given by the package" in done.stderr
+    assert f"the package {name} (tally:PLUGIN)" in done.stderr and "the package muster (" in done.stderr
+
+
 def test_a_plugin_that_can_t_be_imported_ends_a_command_with_one_line(tmp_path: Path) -> None:
-    (tmp_path / "broken-1.dist-info").mkdir()
-    (tmp_path / "broken-1.dist-info" / "entry_points.txt").write_text("[muster.plugins]\nbroken = broken:PLUGIN\n")
-    (tmp_path / "broken.py").write_text("1 / 0\n")
+    write_package(tmp_path, "broken", "1 / 0")
     done = run_muster("--help", home=tmp_path, PYTHONPATH=str(tmp_path))
-    words = "plug-in: broken:PLUGIN can't be imported (division by zero); install its package again, or remove it"
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", f"muster: {words}\n")
+    words = "plug-in broken of the package broken: broken:PLUGIN can't be imported (division by zero)"
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == f"muster: {words}; install its package again, or remove it\n"

@@ -5,15 +5,18 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from importlib.metadata import entry_points
+from collections.abc import Iterable
+from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING
 
-from shared_store.contract.error_text import nearest, unknown_task
+from shared_store.contract.entry_points import clash
+from shared_store.contract.error_text import unknown_task
 from worker.tasks.run.mistakes import task_mistakes
 
 if TYPE_CHECKING:
     from worker.tasks.run.task import Task
 
+_GROUP = "muster.tasks"
 BUILT_IN = {
     "Cartpole": "worker.tasks.library.cartpole:Cartpole",
     "CartpolePixels": "worker.tasks.library.cartpole_pixels:CartpolePixels",
@@ -32,8 +35,11 @@ BUILT_IN = {
 
 def task_names() -> dict[str, str]:
     """Every known task: its name and its class (``module:Class``), sorted by name."""
-    found = {point.name: point.value for point in entry_points(group="muster.tasks")}
-    return dict(sorted((BUILT_IN | found).items()))
+    return _classes(entry_points(group=_GROUP))
+
+
+def _classes(points: Iterable[EntryPoint]) -> dict[str, str]:
+    return dict(sorted((BUILT_IN | {point.name: point.value for point in points}).items()))
 
 
 def find_task(name: str) -> type[Task]:
@@ -44,9 +50,13 @@ def find_task(name: str) -> type[Task]:
             ``module:Class``.
 
     Raises:
-        ValueError: The task does not exist, the class is not a task, or the user's module can't be imported.
+        ValueError: The task does not exist, two packages have one of this name, the class is not a task, or the user's module
+            can't be imported.
     """
-    known = task_names()
+    points = entry_points(group=_GROUP)
+    if words := clash(points, name, BUILT_IN.get(name, "")):
+        raise ValueError(f"task {name!r}: {words}")
+    known = _classes(points)
     where = name if ":" in name else known.get(name)
     if where is None:
         raise ValueError(unknown_task(name, known))

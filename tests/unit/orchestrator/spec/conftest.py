@@ -7,13 +7,13 @@ from functools import cache
 
 import pytest
 
-from orchestrator.spec import settings, values
+from orchestrator.spec import model, settings, values
 
 
 @pytest.fixture(scope="module")
 def installed_once() -> Iterator[None]:
     """Most of the time of a validation is the look at all installed packages."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (settings, values):
+        for module in (model, settings, values):
             patch.setattr(module, "entry_points", cache(module.entry_points))
         yield
