@@ -10,7 +10,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING
 
 from shared_store.contract.entry_points import clash
-from shared_store.contract.error_text import unknown_task
+from shared_store.contract.error_text import nearest, unknown_task
 from worker.tasks.run.mistakes import task_mistakes
 
 if TYPE_CHECKING:
