@@ -6,9 +6,8 @@ job model. It is carried whole in the definition's environment, so that a run ca
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
@@ -26,7 +25,6 @@ from pydantic import (
 )
 
 from orchestrator.domain.errors import SpecError
-from orchestrator.domain.gang import DEEPEST_SPEC
 from orchestrator.spec.sections import (
     ACCEPT,
     CheckpointPolicy,
@@ -39,6 +37,7 @@ from orchestrator.spec.sections import (
     Share,
 )
 from orchestrator.spec.settings import effective_problem, section_of, settings_classes, task_config, train_section
+from orchestrator.spec.storable import Problem, not_finite, not_storable
 from orchestrator.spec.tracking_services import TrackingServices, key_in
 from orchestrator.spec.values import (
     Argument,
@@ -314,7 +313,7 @@ def validate(
     """
     if not isinstance(value, dict):
         raise SpecError(f"{source}: expected a mapping of keys such as name, nodes, train; found {kind_of(value)}")
-    if problem := _not_storable(value):
+    if problem := not_storable(value):
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")
     try:
@@ -330,7 +329,7 @@ def validate(
         first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
         path = tuple(part for part in path_of(first) if isinstance(part, str | int))
         raise SpecError(f"{place_of(path, source, lines)}{_explain(first, path)}{more}") from None
-    problem = _not_finite(value)
+    problem = not_finite(value)
     if not problem and spec.train:
         problem = _of_another_algorithm(spec.train) or (_problem_of(spec.train) if merged else None)
     if problem:
@@ -357,40 +356,7 @@ def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
     return {**document, "train": plain}, notes
 
 
-_Problem = tuple[tuple[str | int, ...], str]
-"""Keys to a value of the spec, and what is wrong with it in one line."""
-
-
-def _values(document: object) -> Iterator[tuple[tuple[str | int, ...], Any]]:
-    """Every value of a document with the keys that lead to it, the outer ones first."""
-    left: list[tuple[tuple[str | int, ...], Any]] = [((), document)]
-    while left:
-        path, value = left.pop()
-        yield path, value
-        items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-        left += [((*path, key), each) for key, each in items]
-
-
-def _not_finite(document: object) -> _Problem | None:
-    """The spec travels as JSON, which has no infinity."""
-    found = (
-        (path, value) for path, value in _values(document) if isinstance(value, float) and not math.isfinite(value)
-    )
-    return next(((path, f"expected a finite number, found {kind_of(value)}") for path, value in found), None)
-
-
-def _not_storable(document: object) -> _Problem | None:
-    """What could be stored but never shown again: half of a character, and more levels than an answer may have."""
-    for path, value in _values(document):
-        if len(path) >= DEEPEST_SPEC:
-            return path[:1], f"nested deeper than {DEEPEST_SPEC} levels"
-        for text in value if isinstance(value, dict) else (value,):
-            if isinstance(text, str) and not text.isascii() and any("\ud800" <= each <= "\udfff" for each in text):
-                return path, f"half of a character (a lone surrogate) in {shown(text)}; write whole ones"
-    return None
-
-
-def _of_another_algorithm(train: _Train) -> _Problem | None:
+def _of_another_algorithm(train: _Train) -> Problem | None:
     """Settings of an algorithm that is not the chosen one would change nothing."""
     given = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(train, name)).values())]
     given += ["settings"] if train.settings else []
@@ -401,7 +367,7 @@ def _of_another_algorithm(train: _Train) -> _Problem | None:
     return None
 
 
-def _problem_of(train: _Train) -> _Problem | None:
+def _problem_of(train: _Train) -> Problem | None:
     """A value of the task's configuration or of the algorithm's settings that the rank would refuse, and why; None where there is none.
 
     The settings of a task that is not installed here are checked by its rank.

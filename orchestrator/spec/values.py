@@ -11,7 +11,6 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import excerpt
-from orchestrator.spec.task_modules import module_problem
 from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import shown, unknown_task
 from shared_store.volume.layout import NAME
@@ -79,20 +78,13 @@ def _job_name(value: str) -> str:
 
 
 def task_name(value: str) -> str:
-    """The name of an installed task, or ``module:Class``.
-
-    Raises ValueError for another, where two packages have one of this name, and where the task can't be imported.
-    """
+    """The name of an installed task, or ``module:Class``. Raises ValueError for another, and where two packages have one of this name."""
     points = entry_points(group="muster.tasks")
     if words := clash(points, value):
         raise ValueError(words)
-    places = {point.name: point.value for point in points}
-    if ":" in value:
-        return value
-    if value not in places:
-        raise ValueError(unknown_task(value, sorted(places)))
-    if words := module_problem(places[value]):
-        raise ValueError(f"task {value} can't be imported: {words}; install another version of its package")
+    known = sorted({point.name for point in points})
+    if ":" not in value and value not in known:
+        raise ValueError(unknown_task(value, known))
     return value
 
 
