@@ -74,3 +74,17 @@ def test_what_the_pages_import_is_there() -> None:
         except ModuleNotFoundError:
             found = None
         assert found is not None or find_spec(f"{module}.{name}") is not None, f"{module}.{name}"
+
+
+EXAMPLE = sorted((REPOSITORY / "docs" / "examples" / "notes" / "muster_notes").glob("*.py"))
+
+
+@pytest.mark.parametrize("module", EXAMPLE, ids=lambda module: module.name)
+def test_the_example_of_a_plug_in_imports_what_its_page_allows(module: Path) -> None:
+    page = (REPOSITORY / "docs" / "plug-ins.md").read_text()
+    allowed = set(re.findall(r"^\| `((?:orchestrator|worker|shared_store)\.[a-z_.]+)` \|", page, re.MULTILINE))
+    found = {match[1]: match[2] for match in IMPORT.finditer(module.read_text())}
+    assert found.keys() <= allowed
+    assert not any(re.search(r"\b_", names) for names in found.values())
+    sides = {name.partition(".")[0] for name in found} - {"shared_store"}
+    assert len(sides) <= 1, "a rank reads it, or the controller"

@@ -16,6 +16,8 @@ import pytest
 from shared_store.volume.layout import Store
 from shared_store.volume.references import Needed, references
 from tests.conftest import REPOSITORY, Serving, run_muster
+from tests.support.keys import HomeKeys
+from tests.support.orchestrator.trained import add_run
 from tests.support.plugin_packages import write_package
 
 JOB = "name: noted\nresources: {cpus: 0.1, memory: 16MiB}\ncommand: ['true']\n"
@@ -53,7 +55,7 @@ def test_its_command_route_and_page_are_there(server: Serving) -> None:
     run = run_of(server)
     told = run_muster("notes", run, "walks sideways", home=server.home)
     assert (told.returncode, told.stdout) == (0, f"{run}: walks sideways\n"), told.stderr
-    assert "Print the notes on runs, or add one." in run_muster("--help", home=server.home).stdout
+    assert "Print the notes on all runs or on one, or add one." in run_muster("--help", home=server.home).stdout
     assert server.client.get("/api/notes") == [{"run": run, "notes": ["walks sideways"]}]
     page = httpx.get(f"{server.url}/notes", headers={"accept": "text/html"})
     assert page.status_code == 200 and "walks sideways" in page.text
@@ -77,10 +79,65 @@ def test_its_folder_keeps_runs_from_being_deleted_also_once_it_is_removed(server
     found = subprocess.run(
         [sys.executable, "-c", look], env={**os.environ, "PYTHONPATH": ""}, capture_output=True, text=True, check=True
     ).stdout
-    assert (
-        "what the store's notes need can't be known without the plug-in notes; install it, or move them away" in found
-    )
+    assert "plug-in 'notes' is not installed, so what its folder" in found
     assert Needed("run", run, "there is a note on it") not in references(Store(server.home / "store"))[0]
+
+
+def test_once_it_is_removed_no_run_and_no_job_is_deleted_until_its_folder_is_moved_away(
+    installed: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "job.yaml").write_text(JOB)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(installed))
+        with Serving(tmp_path, "--cpus", "4") as server:
+            for _ in range(2):
+                assert run_muster("run", str(tmp_path / "job.yaml"), home=tmp_path).returncode == 0
+            run, other = [str(each["run"]) for each in server.client.get("/api/runs")]
+            assert run_muster("notes", run, "keep it", home=tmp_path).returncode == 0
+    folder = tmp_path / "store" / "notes"
+    words = (
+        f"plug-in 'notes' is not installed, so what its folder {folder} needs can't be known; install the package that brings it, "
+        "or move the folder out of the store\n"
+    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("PYTHONPATH", raising=False)
+        with Serving(tmp_path, "--cpus", "4") as server:
+            kept = server.muster("gc", "--older-than", "0m")
+            assert kept.stdout.splitlines(keepends=True)[0] == f"kept: runs {run}, {other}: {words}"
+            assert "deleted 0 jobs and 0 runs" in kept.stdout and len(server.client.get("/api/runs")) == 2
+            refused = server.muster("runs", "delete", other, "--yes")
+            assert (refused.returncode, refused.stderr) == (1, f"muster: run {other} is kept: {words}")
+            folder.rename(tmp_path / "notes")
+            assert "deleted 2 jobs and 2 runs" in server.muster("gc", "--older-than", "0m").stdout
+
+
+def test_a_key_sees_the_notes_on_runs_that_it_may_see(installed: Path, tmp_path: Path) -> None:
+    keys, store = HomeKeys(tmp_path), Store(tmp_path / "store").open()
+    every, some = keys.create("every"), keys.create("some", ["shared"])
+    add_run(store, "hidden", queue="default")
+    add_run(store, "shown", queue="shared")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", str(installed))
+        with Serving(tmp_path, "--cpus", "1") as server:
+            of = {key.name: {"authorization": f"Bearer {key.access_key_id}:{key.secret}"} for key in (every, some)}
+            for run in ("hidden", "shown"):
+                sent = {"url": f"{server.url}/api/notes/{run}", "json": {"text": f"on {run}"}}
+                assert httpx.post(**sent, headers=of["every"]).status_code == 200
+                assert httpx.post(**sent, headers=of["some"]).status_code == {"hidden": 404, "shown": 200}[run]
+            found = {name: httpx.get(f"{server.url}/api/notes", headers=each).json() for name, each in of.items()}
+            assert [each["run"] for each in found["every"]] == ["hidden", "shown"]
+            assert found["some"] == [{"run": "shown", "notes": ["on shown", "on shown"]}]
+            page = httpx.get(f"{server.url}/notes", headers={**of["some"], "accept": "text/html"}).text
+            assert "on shown" in page and "on hidden" not in page
+
+
+@pytest.mark.parametrize("text", ["", "  "])
+def test_an_empty_note_is_one_error(server: Serving, text: str) -> None:
+    run = run_of(server)
+    done = run_muster("notes", run, text, home=server.home)
+    words = "muster: TEXT: the note is empty; write some words, or leave it out to print the notes\n"
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", words)
+    assert httpx.post(f"{server.url}/api/notes/{run}", json={"text": text}).status_code == 400
 
 
 def test_its_task_and_its_part_of_a_bundle_are_found(installed: Path) -> None:

@@ -237,6 +237,15 @@ def test_tasks_are_found_by_name_or_refused_with_the_nearest() -> None:
         find_task("worker.tasks.library.ant:Cat")
 
 
+def test_a_module_that_exits_ends_nothing_but_the_search_for_its_task(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "exiting.py").write_text("raise SystemExit(3)\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(ValueError, match=r"^task 'exiting:Task': exiting exits when it is imported \(code 3\)$"):
+        find_task("exiting:Task")
+
+
 @pytest.mark.parametrize(
     ("config", "arguments", "message"),
     [

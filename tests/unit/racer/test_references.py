@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import pytest
+
 from racer.store import leagues
+from shared_store.volume import plugin_folders
+from shared_store.volume import references as module
 from shared_store.volume.layout import Store
 from shared_store.volume.references import references
 from tests.support.permissions import permissions_count
@@ -40,3 +44,17 @@ def test_a_league_that_can_t_be_read_hides_no_other(store: Store) -> None:
     entries.chmod(0o755)
     assert {each.by for each in found} == {"entry 1 of league bowl cites it"}
     assert any(each.why.startswith("league cup can't be read ([Errno 13]") for each in unreadable), unreadable
+
+
+def test_without_the_racer_its_folders_may_need_any_run_and_any_job(
+    store: Store, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    leagues.create(store, league()).enter(entry("racer", "key a"))
+    plugin_folders.note_plugins(store)
+    for each in (plugin_folders, module):
+        monkeypatch.setattr(each, "plugins", dict)
+    found, [unreadable] = references(store)
+    assert found == [] and unreadable.whole
+    assert f"plug-in 'racer' is not installed, so what its folder {store.path / 'leagues'} needs" in unreadable.why
+    (store.path / "tracks").mkdir()
+    assert f"{store.path / 'tracks'} and {store.path / 'leagues'} need" in references(store)[1][0].why

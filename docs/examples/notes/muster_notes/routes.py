@@ -8,7 +8,7 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
-from orchestrator.services.context import permitted_run
+from orchestrator.services.context import permitted_run, visible_runs
 from orchestrator.services.permissions import AddedOperation
 
 router, pages = APIRouter(route_class=StoreRoute), page_router(stored=True)
@@ -17,13 +17,16 @@ router, pages = APIRouter(route_class=StoreRoute), page_router(stored=True)
 class Note(BaseModel):
     """A note."""
 
-    text: str = Field(min_length=1, max_length=500)
+    text: str = Field(pattern=r"\S", max_length=500)
 
 
 @router.get("/notes")
 def read_notes(request: Request) -> list[dict[str, object]]:
-    """The notes on all runs."""
-    return stored.notes(controller_of(request).access.store)
+    """The notes on the runs that the caller may see."""
+    controller, actor = controller_of(request), actor_of(request)
+    notes = stored.notes(controller.access.store)
+    seen = visible_runs(controller, actor, among=lambda run: run.name in notes)
+    return [{"run": run.name, "notes": notes[run.name]} for run in seen]
 
 
 @router.post("/notes/{run}")
@@ -44,5 +47,5 @@ def forgotten() -> str:
 
 @pages.get("/notes")
 def page(request: Request) -> Response:
-    """All notes."""
+    """The same as a page."""
     return render(request, "notes.html", notes=read_notes(request))

@@ -1,4 +1,4 @@
-"""Notes in the store: ``notes/<run>.json``."""
+"""Notes in the store: ``notes/<run>``, a JSON file for each run that has some."""
 
 from shared_store.volume.files import read_json, write_json
 from shared_store.volume.layout import Store, names_in
@@ -7,17 +7,18 @@ from shared_store.volume.references import Found, needed_run
 
 def add(store: Store, run: str, text: str) -> None:
     """Add a note on a run. Raises StoreError for a name that no run has, OSError."""
-    path = store.path / "notes" / f"{store.run(run).name}.json"
+    path = store.path / "notes" / store.run(run).name
     path.parent.mkdir(exist_ok=True)
-    write_json(path, {"run": run, "notes": [*(read_json(path) or {"notes": []})["notes"], text]})
+    write_json(path, {"notes": [*(read_json(path) or {}).get("notes", []), text]})
 
 
-def notes(store: Store) -> list[dict[str, object]]:
+def notes(store: Store) -> dict[str, list[str]]:
     """All notes by run. Raises DamagedFile, OSError."""
-    return [read_json(store.path / "notes" / name) or {} for name in names_in(store.path / "notes")]
+    found = {run: read_json(store.path / "notes" / run) or {} for run in names_in(store.path / "notes")}
+    return {run: document.get("notes", []) for run, document in found.items()}
 
 
 def references(store: Store) -> Found:
     """A run with a note is not deleted."""
-    for note in notes(store):
-        yield from needed_run(note.get("run"), "there is a note on it")
+    for run in notes(store):
+        yield from needed_run(run, "there is a note on it")
