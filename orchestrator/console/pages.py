@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from http import HTTPStatus
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -57,20 +58,18 @@ NAVIGATION = (
 
 def _template_folders() -> list[Path]:
     """The folder of the console's templates, and those of plug-ins. Raises PluginError: one is not there, or hides another's template."""
-    found, owners = [Path(__file__).parent / "templates"], dict[str, str]()
+    found = [Path(__file__).parent / "templates"]
     for name, package in ((name, plugin.templates) for name, plugin in plugins().items() if plugin.templates):
-        there = [Path(place) / "templates" for place in getattr(load(package), "__path__", ())]
-        if not any(folder.is_dir() for folder in there):
-            raise PluginError(f"plug-in {name}: templates: package {package} has no folder templates; install it again")
-        found += there
-    for folder in found:
-        for template in sorted(folder.glob("**/*.html")):
-            key = str(template.relative_to(folder))
-            if key in owners:
-                raise PluginError(
-                    f"plug-in: the template {key} is in {owners[key]} and in {folder}; one of them needs another name"
-                )
-            owners[key] = str(folder)
+        folders = [Path(place) / "templates" for place in getattr(load(package), "__path__", ())]
+        added = [str(each.relative_to(folder)) for folder in folders for each in folder.glob("**/*") if each.is_file()]
+        if not added:
+            raise PluginError(
+                f"plug-in {name}: templates: {package} has no folder templates with files; install it again"
+            )
+        for template, before in product(sorted(added), found):
+            if (before / template).exists():
+                raise PluginError(f"plug-in {name}: the template {template} is there already, in {before}; rename it")
+        found += folders
     return found
 
 

@@ -40,6 +40,7 @@ from orchestrator.spec.evaluations import (
     wanted_of,
 )
 from orchestrator.spec.sections import Evaluation
+from shared_store.contract.plugins import PluginError
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.evaluations import evaluation_is_over, keep_for_evaluation, wanted_checkpoints
 from shared_store.volume.layout import Run
@@ -137,7 +138,7 @@ class AutomaticEvaluations:
             self._backoff.worked(subject)
         except Unavailable:
             pass  # said by the controller
-        except (OSError, ValueError, DamagedCheckpoint) as error:
+        except (OSError, ValueError, DamagedCheckpoint, PluginError) as error:
             self._backoff.failed(subject, f"automatic evaluations, {subject}: {' '.join(str(error).split())}")
         except Exception as error:
             self._backoff.failed(subject, f"automatic evaluations, {subject}: {type(error).__name__}", error)

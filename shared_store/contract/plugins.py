@@ -150,8 +150,11 @@ class JobSection:
 class Plugin:
     """What a package adds. Tasks and algorithms are entry points of ``muster.tasks`` and ``muster.algorithms`` in the same package.
 
+    A field of another form raises PluginError where it is declared, which every command does.
+
     Attributes:
-        operations: ``METHOD /path`` of every route and page below; a route that is not here is refused for every key.
+        operations: ``METHOD /path`` of every route and page below, with ``/api`` for a route; one that is not here is refused for every
+            key.
         routers: ``module:router`` of FastAPI, under ``/api``.
         pages: ``module:router`` of pages of the console.
         navigation: Label and path of their entries in the console's navigation.
@@ -160,8 +163,8 @@ class Plugin:
         commands: Of ``muster``.
         options: Name of a command of Muster, and ``module:name`` of its :class:`orchestrator.cli.catalogue.FurtherOptions`.
         sections: Kinds of jobs.
-        folders: In the store, beside ``runs`` and ``models``.
-        run_folders: In a run.
+        folders: In the store, beside :data:`OF_STORE`.
+        run_folders: In a run, beside :data:`OF_RUN`.
         references: ``module:function``: from a store to the runs and jobs that the plug-in's folders need, see
             :mod:`shared_store.volume.references`.
         bundle_parts: ``module:function``: from a task to further JSON documents of an exported bundle, by the names of their files.

@@ -194,7 +194,7 @@ BROKEN = {
         "options: tally_parts:MORE is int, and",
     ),
     "templates='nowhere'": ("serve", "", "templates: nowhere can't be imported (No module named 'nowhere')"),
-    "templates='tally'": ("serve", "", "templates: package tally has no folder templates; install it again"),
+    "templates='tally'": ("serve", "", "templates: tally has no folder templates with files; install it"),
     "routers=('tally_parts:router',)": ("serve", "", "routers: tally_parts:router can't be imported"),
     "pages=('tally_parts:pages',)": (
         "run JOB",
@@ -229,6 +229,16 @@ def test_a_part_that_can_t_be_used_ends_a_command_with_one_line_that_names_the_p
     done = run_muster(*arguments, home=tmp_path, PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done.stderr
     assert done.stderr.startswith(f"muster: plug-in tally: {words}")
+
+
+def test_a_template_that_hides_another_is_refused(tmp_path: Path) -> None:
+    write_package(tmp_path, "tally", "Plugin(templates='tally_pages')")
+    (tmp_path / "tally_pages" / "templates").mkdir(parents=True)
+    (tmp_path / "tally_pages" / "__init__.py").touch()
+    (tmp_path / "tally_pages" / "templates" / "job.html").touch()
+    done = run_muster("serve", home=tmp_path, PYTHONPATH=str(tmp_path))
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert done.stderr.startswith("muster: plug-in tally: the template job.html is there already, in ")
 
 
 def test_a_rank_ends_with_one_line_where_a_part_can_t_be_used(tmp_path: Path) -> None:

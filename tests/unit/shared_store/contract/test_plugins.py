@@ -10,7 +10,18 @@ from typing import Any
 import pytest
 
 from shared_store.contract import plugins as declared
-from shared_store.contract.plugins import Command, JobSection, Plugin, PluginError, load, plugins, rules_of, sections
+from shared_store.contract.plugins import (
+    OF_RUN,
+    OF_STORE,
+    Command,
+    JobSection,
+    Plugin,
+    PluginError,
+    load,
+    plugins,
+    rules_of,
+    sections,
+)
 from shared_store.volume.layout import Store
 from shared_store.volume.references import references
 from tests.support.plugin_packages import write_package
@@ -59,6 +70,14 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 )  # fmt: skip
 def test_a_field_of_another_form_is_refused_by_its_name(declare: Callable[[], object], words: str) -> None:
     assert refusal(declare, error=PluginError) == words
+
+
+def test_no_folder_is_one_of_the_layout(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for owner, known in ((store, OF_STORE), (store.run("ant-1"), OF_RUN)):
+        paths = [getattr(owner, name) for name, each in vars(type(owner)).items() if isinstance(each, property)]
+        folders = {each.name for each in paths if isinstance(each, Path) and not each.suffix}
+        assert folders and folders <= known
 
 
 def test_a_package_whose_declaration_is_wrong_is_named_with_the_plug_in(folder: Path) -> None:
@@ -157,4 +176,6 @@ def test_rules_lack_nothing(folder: Path) -> None:
 )  # fmt: skip
 def test_references_that_fail_may_need_anything(folder: Path, code: str, words: str) -> None:
     write_package(folder, "tally", "Plugin(references='tally_parts:references')", code)
-    assert references(Store(folder / "store")) == ([], [f"plug-in tally: references: tally_parts:references {words}"])
+    needed, unreadable = references(Store(folder / "store"))
+    assert (len(needed), len(unreadable)) == (0, 1)
+    assert f"plug-in tally: references: tally_parts:references {words}" in str(unreadable[0])
