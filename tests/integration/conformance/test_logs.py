@@ -32,6 +32,12 @@ def quiet(shared_server: Serving) -> str:
     return finished(shared_server, "print('quiet')", name="quiet")
 
 
+def searched(logs: Any, **query: Any) -> list[dict[str, Any]]:
+    """The events of all pages of a search: a page ends after two seconds, too."""
+    pages = logs.get_paginator("filter_log_events").paginate(**query)
+    return [event for page in pages for event in page["events"]]
+
+
 # -- GetLogEvents -----------------------------------------------------------------------------------------------------
 
 
@@ -135,10 +141,10 @@ def test_times_never_fall_when_a_clock_steps_back(shared_server: Serving, logs: 
     append(shared_server, quiet, "before", seconds=high)
     append(shared_server, quiet, *(f"{'x' * 100} {i}" for i in range(1000)), "after", seconds=high - 8)
     name = stream_of(shared_server, quiet)
-    whole = logs.filter_log_events(logGroupName=GROUP, logStreamNames=[name])["events"]
+    whole = searched(logs, logGroupName=GROUP, logStreamNames=[name])
     assert [event["timestamp"] for event in whole] == [high * 1000] * 1002
     # whoever had seen "before" asks from its time on, which begins deep in the file, and must find the same events
-    assert logs.filter_log_events(logGroupName=GROUP, logStreamNames=[name], startTime=high * 1000)["events"] == whole
+    assert searched(logs, logGroupName=GROUP, logStreamNames=[name], startTime=high * 1000) == whole
     last = logs.get_log_events(logGroupName=GROUP, logStreamName=name, limit=1)["events"]
     assert last == [{"timestamp": high * 1000, "ingestionTime": high * 1000, "message": "after"}]
 
@@ -189,12 +195,12 @@ def test_streams_are_merged_by_time_and_pages_are_the_same_as_one(shared_server:
     reverse = logs.get_paginator("filter_log_events").paginate(**query, **backwards)
     assert [event for page in reverse for event in page["events"]] == events[::-1]
     names = [stream_of(shared_server, trio, node) for node in (2, 0)]
-    named = logs.filter_log_events(logGroupName=GROUP, logStreamNames=names, filterPattern=query["filterPattern"])
-    assert named["events"] == [event for event in events if event["logStreamName"] in names]
+    named = searched(logs, logGroupName=GROUP, logStreamNames=names, filterPattern=query["filterPattern"])
+    assert named == [event for event in events if event["logStreamName"] in names]
 
 
 def test_without_a_stream_the_whole_group_is_searched(logs: Any, trio: str, counted: str) -> None:
-    found = logs.filter_log_events(logGroupName=GROUP, filterPattern='?"2:59" ?"line 0042"')["events"]
+    found = searched(logs, logGroupName=GROUP, filterPattern='?"2:59" ?"line 0042"')
     assert {f"trio/{trio}/1/node-2", f"counted/{counted}/1/node-0"} <= {event["logStreamName"] for event in found}
     assert {event["message"] for event in found} == {"2:59", "line 0042"}
 
@@ -202,13 +208,13 @@ def test_without_a_stream_the_whole_group_is_searched(logs: Any, trio: str, coun
 def test_event_ids_are_the_same_after_a_restart_and_from_any_start(server: Serving) -> None:
     job = finished(server, "for i in range(3000): print('text of line', i)")
     query = {"logGroupName": GROUP, "logStreamNames": [stream_of(server, job)]}
-    before = client_of(server.url).filter_log_events(**query)["events"]
+    before = searched(client_of(server.url), **query)
     server.kill()
     server.start()
     logs = client_of(server.url)
     since = before[2500]["timestamp"]
-    assert logs.filter_log_events(**query, startTime=since)["events"] == [e for e in before if e["timestamp"] >= since]
-    assert logs.filter_log_events(**query)["events"] == before and len(before) == 3000
+    assert searched(logs, **query, startTime=since) == [e for e in before if e["timestamp"] >= since]
+    assert searched(logs, **query) == before and len(before) == 3000
 
 
 @pytest.mark.parametrize(
