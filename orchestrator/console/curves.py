@@ -5,19 +5,14 @@
 wanted, and each ``name`` a metric, or a group of them with a ``*`` at its end (``reward_*``); all numbers where no name is given.
 ``env_steps``, ``total_seconds`` and ``time`` are metrics too, and serve as the other axis.
 
-``static/curves.js`` draws them::
-
-    import { Chart, read } from "./curves.js";
-    const chart = new Chart(figure, { label: "Reward", isStacked: false });    // figure: an empty <figure>
-    chart.draw({ x: [1, 2], xLabel: "iteration", lines: [{ name: "seed 1", y: [0.1, null], low: [0, 0], high: [1, 1] }] });
-    figure.addEventListener("window", (event) => event.detail);                // {from, to} of x that a person chose; null: everything
-    const curves = await read("/runs/NAME/curves", { names: ["reward"], from: 1, to: 900, points: 400 });
-
-The first six lines differ in colour, further ones in their dashes as well; a line with ``low`` and ``high`` has a band between them.
+``static/curves.js`` draws them: ``Chart`` a chart of any lines, ``RunCurves`` the charts of a run that its stream continues
+(:class:`NewIterations`). The first six lines differ in colour, further ones in their dashes as well; a line with ``low`` and
+``high`` has a band between them.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
@@ -26,12 +21,13 @@ from typing import Any
 from fastapi import Query, Request
 
 from orchestrator.api.http.requests import actor_of, controller_of
-from orchestrator.console.live import Recent
+from orchestrator.console.live import Recent, ServerSentEvent
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Operation
 from shared_store.volume.layout import Run
+from shared_store.volume.learning_metrics import LEARNING
 from shared_store.volume.metrics import finite, history_of, sampled
 
 router = page_router("name", stored=True)
@@ -41,6 +37,10 @@ POINTS = 300
 _MOST_POINTS = 1000
 _MOST_READ = 4000
 """Records that are read for an answer."""
+_RECORDS = 200
+"""Iterations that one event brings; a page that has missed more reads its curves again."""
+LABELS = {each.name: each.label for each in LEARNING}
+"""Of the algorithms' metrics."""
 _recent = Recent()
 
 
@@ -101,14 +101,55 @@ def columns(records: Sequence[Mapping[str, Any]], names: Iterable[str]) -> dict[
     """
     iterations = [each["iteration"] for each in records]
     records = [_single(each) for each in records]
-    known = {name for each in records for name in each if name != "iteration"}
-    wanted: dict[str, None] = {}
-    for name in names:
-        fitting = sorted(each for each in known if each.startswith(name[:-1])) if name.endswith("*") else [name]
-        wanted |= dict.fromkeys(fitting)
-    series = {name: [number(each.get(name)) for each in records] for name in wanted if name in known}
-    there = {name: values for name, values in series.items() if any(value is not None for value in values)}
-    return {"iterations": iterations, "series": there}
+    known = sorted({name for each in records for name in each if name != "iteration"})
+    series = {
+        each: [number(record.get(each)) for record in records]
+        for name in names
+        for each in known
+        if each == name or (name.endswith("*") and each.startswith(name[:-1]))
+    }
+    drawn = {name: values for name, values in series.items() if any(value is not None for value in values)}
+    return {"iterations": iterations, "series": drawn}
+
+
+class NewIterations:
+    """The iterations that are new to the curves of one page."""
+
+    def __init__(self, run: Run, newest: int | None, names: Sequence[str] = ("*",)) -> None:
+        """``newest``: the last one that the page has; None: the next is the newest. ``names``: as :func:`columns`."""
+        self.newest = newest
+        self._run, self._names = run, names
+
+    def changes(self) -> list[ServerSentEvent]:
+        """The event ``metrics``, or none; its data are ``again`` where an attempt went back behind the page's last iteration, or it has missed too many."""
+        newest = max((each["iteration"] for each in sampled(self._run, 2)), default=0)
+        before, self.newest = self.newest, newest
+        if before is None or newest == before:
+            return []
+        records = history_of(self._run).after(before, _RECORDS + 1) if newest > before else []
+        if newest < before or len(records) > _RECORDS:
+            return [ServerSentEvent("metrics", {"again": True})]
+        # not ``newest``: one may have been written since that look, or a long history is not read to its end yet
+        self.newest = records[-1]["iteration"] if records else before
+        return [ServerSentEvent("metrics", columns(records, self._names))] if records else []
+
+
+def position(iteration: int | None, log: Mapping[str, int]) -> str:
+    """The id of an event: the page's last iteration and its positions in the log."""
+    return json.dumps({"i": iteration, "l": log}, separators=(",", ":"))
+
+
+def read_position(given: str) -> tuple[int | None, dict[str, int] | None]:
+    """Iteration and log of :func:`position`; None for each if it can't be read."""
+    try:
+        read = json.loads(given)
+        iteration, log = read["i"], read["l"]
+        fits = all(isinstance(each, int) and 0 <= each < 2**63 for each in log.values())
+        if fits and (iteration is None or isinstance(iteration, int)):
+            return iteration, dict(log)
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
+        pass
+    return None, None
 
 
 def _single(record: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -1,4 +1,7 @@
-"""Formats of numbers, times and attributes on the pages. A job may write anything: a value other than a number is shown as an empty text."""
+"""Formats of numbers, times and facts on the pages.
+
+A job may write anything: where a number is expected, a value of another kind is shown as an empty text.
+"""
 
 from __future__ import annotations
 
@@ -9,11 +12,14 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
+from shared_store.contract.error_text import counted
 from shared_store.volume.metrics import finite
 
 _UNITS = ((86400, "d"), (3600, "h"), (60, "min"))
 _SPARK = (100.0, 24.0)
 """Width and height of a sparkline."""
+_NODES = 16
+"""Number of an attempt's nodes that are named."""
 
 
 def duration(seconds: Any) -> str:
@@ -32,22 +38,30 @@ def duration(seconds: Any) -> str:
     return " ".join(part for part in parts[:2] if not part.startswith("0 "))
 
 
-def ago(moment: int | None) -> str:
-    """The time since a moment, a Unix time [ms]; empty for None."""
-    return "" if moment is None else duration(time.time() - moment / 1000)
-
-
-def moment(when: int | float | None) -> str:
-    """Unix time [ms] for the attribute ``datetime`` of a ``<time>``; empty for None, and beyond all calendars."""
+def moment(when: Any, unit: float = 1) -> str:
+    """A Unix time in units of so many ms, for the attribute ``datetime`` of a ``<time>``; empty for anything else, and beyond all calendars."""
     try:
-        return "" if when is None else datetime.fromtimestamp(when / 1000, UTC).isoformat(timespec="seconds")
+        known = finite(when)
+        return "" if known is None else datetime.fromtimestamp(known * unit / 1000, UTC).isoformat(timespec="seconds")
     except (ValueError, OverflowError, OSError):  # what a file of the store says may be anything
         return ""
 
 
-def since(iso: str) -> str:
-    """:func:`ago` for a text of :func:`moment`."""
-    return ago(int(datetime.fromisoformat(iso).timestamp() * 1000)) if iso else ""
+def age(when: Any, unit: float = 1) -> Markup:
+    """How long a Unix time is past, in units of so many ms, as a ``<time>`` that ``static/times.js`` renews; empty for anything else."""
+    if not (iso := moment(when, unit)):
+        return Markup()
+    return Markup(f'<time datetime="{iso}" data-since>{duration(time.time() - when * unit / 1000)}</time>')
+
+
+def ran(facts: Mapping[str, Any]) -> Markup | str:
+    """How long a job or an attempt has run, by its ``runsSince`` and ``ranSeconds``."""
+    return age(facts["runsSince"]) if facts["runsSince"] else duration(facts["ranSeconds"])
+
+
+def link(address: str, text: str) -> Markup:
+    """A link to a page of the console."""
+    return Markup(f'<a href="{escape(address)}">{escape(text)}</a>')
 
 
 def count(given: Any) -> str:
@@ -62,6 +76,36 @@ def count(given: Any) -> str:
     return f"{value:.0f}" if abs(value) >= 100 or value == int(value) else f"{value:.3g}"
 
 
+def with_error(value: Any, error: Any) -> str:
+    """A number and its standard error, where that is known."""
+    shown, spread = count(value), count(error)
+    return f"{shown} ± {spread}" if shown and spread else shown
+
+
+def interval(result: Mapping[str, Any] | None) -> str:
+    """The ``mean`` of an evaluation, and half of its 95 % interval where its ``high`` end is known."""
+    mean, high = (finite((result or {}).get(each)) for each in ("mean", "high"))
+    if mean is None:
+        return ""
+    return f"{mean:.2f} ± {high - mean:.2f}" if high is not None else f"{mean:.2f}"
+
+
+def size(amount: Any) -> str:
+    """Bytes: ``12 kB``, ``1.5 MiB``, ``3 GiB``; empty for a value other than a number."""
+    known = finite(amount)
+    if known is None:
+        return ""
+    if known < 2**20:
+        return f"{known / 1000:.3g} kB" if known >= 1000 else f"{known:.0f} B"
+    return f"{known / 2**30:.3g} GiB" if known >= 2**30 else f"{known / 2**20:.{1 if known < 2**27 else 0}f} MiB"
+
+
+def amounts(held: Mapping[str, float]) -> str:
+    """CPUs and GPUs, without those of which there are none."""
+    named = ((held["cpus"], "CPU"), (held["gpus"], "GPU"))
+    return ", ".join(f"{amount:g} {unit}{'s' if amount != 1 else ''}" for amount, unit in named if amount)
+
+
 def spark(values: Sequence[float]) -> str:
     """Points of a ``<polyline>`` in a box of 100 × 24, the least value at its bottom; empty for fewer than two values."""
     if len(values) < 2:
@@ -73,20 +117,26 @@ def spark(values: Sequence[float]) -> str:
     )
 
 
-def bound(row: Mapping[str, Any], **targets: str) -> Markup:
-    """Attributes of an element that shows fields of a row: their present values, and which ones a script renews.
+def nodes(found: Sequence[Mapping[str, Any]]) -> str:
+    """The host of each of an attempt's nodes, and how it ended."""
+    named = []
+    for node in found[:_NODES]:
+        gpus = f", {counted(len(node['gpus']), 'GPU')}" if node["gpus"] else ""
+        ending = ""
+        if not node["running"]:
+            code = node.get("exitCode")
+            reason = (node.get("reason") or "").removeprefix(f"exit {code}, ")
+            ending = f" (exit {'?' if code is None else code}{f': {reason}' if reason else ''})"
+        named.append(f"node {node['index']} on {node['host']}{gpus}{ending}")
+    if len(found) > _NODES:
+        named.append(f"and {counted(len(found) - _NODES, 'more node')}")
+    return "; ".join(named)
 
-    ``bound(row, href="link", text="name")``: the attribute ``href`` has the field ``link``; the text, which the template writes itself,
-    is the field ``name``. ``hidden`` hides the element while its field is empty; ``state`` is ``data-state``.
-    """
-    names = " ".join(f"{target}:{field}" for target, field in targets.items())
-    found = [
-        f'data-bind="{escape(names)}"'
-    ]  # the longest part of a large page: Markup's own format() takes thrice the time
-    for target, field in targets.items():
-        value = row.get(field)
-        if target == "hidden":
-            found += [] if value else ["hidden"]
-        elif target != "text" and value not in (None, ""):
-            found.append(f'{"data-state" if target == "state" else escape(target)}="{escape(value)}"')
-    return Markup(" ".join(found))
+
+def cost(attempt: Mapping[str, Any], saves: bool) -> str:
+    """The time on GPUs of an attempt, or on CPUs where it has none; ``saves``: with what was lost since its last checkpoint."""
+    kind = "gpu" if attempt["gpuSeconds"] else "cpu"
+    used, lost = attempt[f"{kind}Seconds"], attempt[f"wasted{kind.title()}Seconds"]
+    if not used:
+        return ""
+    return f"{duration(used)} of {kind.upper()}s" + (f", {duration(lost)} lost" if saves and lost >= 1 else "")

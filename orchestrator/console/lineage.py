@@ -65,16 +65,13 @@ Parent = Callable[[str], Mapping[str, Any] | None]
 """``parent`` of a run (``run``, ``iteration``); None where it has none, is gone or may not be seen."""
 
 
-def drawing(
-    versions: Sequence[Mapping[str, Any]], chosen: int, parent_of: Parent, link: Callable[[str], str] = lambda run: ""
-) -> LineageGraph:
+def drawing(versions: Sequence[Mapping[str, Any]], chosen: int, parent_of: Parent) -> LineageGraph:
     """The graph of a model.
 
     Args:
         versions: ``model.json`` of each version that the caller may see.
         chosen: The version that the page shows.
         parent_of: Looks up the parent of a run.
-        link: Address of a run's page; empty where there is none.
     """
     nodes: dict[str, _Node] = {}
     for each in versions:
@@ -86,16 +83,16 @@ def drawing(
         nodes[f"model {each['version']}"] = _Node(
             name, about, place, is_chosen=each["version"] == chosen, parents={f"run {run}": iteration}
         )
-        _add_run(nodes, run, each.get("parent"), parent_of, link)
+        _add_run(nodes, run, each.get("parent"), parent_of)
     for key in nodes:
         _level(nodes, key, ())
     return _placed(nodes)
 
 
-def _add_run(nodes: dict[str, _Node], run: str, parent: Any, parent_of: Parent, link: Callable[[str], str]) -> None:
+def _add_run(nodes: dict[str, _Node], run: str, parent: Any, parent_of: Parent) -> None:
     """Add a run and all its ancestors; a model keeps its run's parent even where the run is gone."""
     while f"run {run}" not in nodes and len(nodes) < _MOST:
-        node = nodes[f"run {run}"] = _Node(run, "run", link(run))
+        node = nodes[f"run {run}"] = _Node(run, "run", f"/runs/{run}")
         parent = parent if isinstance(parent, Mapping) else parent_of(run)
         if not parent or not parent.get("run"):
             return

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import threading
 import time
 from collections import OrderedDict
@@ -19,7 +20,7 @@ from fastapi.sse import format_sse_event
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.answer_streams import Following, looked_patiently
 from orchestrator.api.http.requests import actor_of, controller_of
-from orchestrator.console.pages import session
+from orchestrator.console.pages import session, shared, templates
 from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.errors import ClientError, Unavailable
 from shared_store.volume.files import DamagedFile
@@ -36,6 +37,8 @@ _LONGEST = 300.0
 _MOST_KEPT = 64
 _REST, _LONGEST_REST = 4.0, 5.0
 """Times as long as a value took to compute it is kept, where that is longer than its time; and the limit of that [s]."""
+_AGE = re.compile(r"(?<= data-since>)[^<]*")
+"""How long something is past: the page itself renews that."""
 _Value = TypeVar("_Value")
 
 
@@ -143,38 +146,43 @@ def _written(event: ServerSentEvent) -> bytes:
     return format_sse_event(data_str=json.dumps(event.data, separators=(",", ":")), event=event.name, id=event.id)
 
 
-class TableRows:
-    """The rows of a live table, and their changes since the last look, by key and field."""
+class Table(dict[str, Any]):
+    """The rows of a live table by their keys, in their order."""
 
-    def __init__(self, name: str = "rows") -> None:
-        """``name``: of its events; a page with several tables has one of each."""
-        self._name = name
-        self._order: list[str] | None = None
-        self._shown: dict[str, Mapping[str, Any]] = {}
-        self._totals: Mapping[str, Any] = {}
 
-    def changes(self, rows: Mapping[str, Mapping[str, Any]], totals: Mapping[str, Any]) -> list[ServerSentEvent]:
-        """One event, or none: the order of the keys, where it changed, and the changed fields of each row; ``totals`` of the whole page.
+class LiveParts:
+    """The live parts of one page, rendered by the macros with which the page itself was rendered, and what the page has been sent of them."""
 
-        Args:
-            rows: Key of each row, in their order, and its fields as texts.
-            totals: Fields that belong to no row.
+    def __init__(self, request: Request, template: str, **values: Any) -> None:
+        """``template``: has a macro for each part, named like the part's id; ``values``: what it needs beside a part's own."""
+        self._macros = templates.get_template(template).make_module(shared(request) | values)
+        self._sent: dict[str, dict[str, tuple[Any, str]]] = {}
+        """By part, and by row of a table, its value and its markup."""
+
+    def changes(self, parts: Mapping[str, Any]) -> list[ServerSentEvent]:
+        """One event ``parts``, or none: by id, the markup of each part that changed.
+
+        Of a :class:`Table` these are ``rows``, the markup of each changed row by its key, and ``order``, all keys where their order changed.
+        The part ``page`` is the text of the page's ``data-page``: a page with another one is loaded again.
         """
-        order = list(rows)
         data: dict[str, Any] = {}
-        if order != self._order:
-            data["order"] = order
-        changed = {key: _difference(self._shown.get(key), row) for key, row in rows.items()}
-        if found := {key: fields for key, fields in changed.items() if fields}:
-            data["rows"] = found
-        if totals != self._totals:
-            data["totals"] = totals
-        self._order, self._shown, self._totals = order, dict(rows), totals
-        return [ServerSentEvent(self._name, data)] if data else []
-
-
-def _difference(before: Mapping[str, Any] | None, after: Mapping[str, Any]) -> Mapping[str, Any]:
-    return after if before is None else {name: value for name, value in after.items() if before.get(name) != value}
+        for name, value in parts.items():
+            before, sent = self._sent.get(name), dict[str, tuple[Any, str]]()
+            render, changed = str if name == "page" else getattr(self._macros, name), dict[str, str]()
+            for key, row in (value if isinstance(value, Table) else {"": value}).items():
+                known = before.get(key) if before else None
+                markup = known[1] if known and known[0] == row else _AGE.sub("", render(row))
+                if known is None or markup != known[1]:
+                    changed[key] = markup
+                sent[key] = row, markup
+            self._sent[name] = sent
+            if not isinstance(value, Table):
+                data |= {name: changed[""]} if changed else {}
+            elif before is None or list(before) != list(sent):
+                data[name] = {"order": list(sent), "rows": changed}
+            elif changed:
+                data[name] = {"rows": changed}
+        return [ServerSentEvent("parts", data)] if data else []
 
 
 class Recent:

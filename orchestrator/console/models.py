@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 from fastapi import Query, Request, Response
@@ -12,6 +13,7 @@ from orchestrator.api.native.run_routes import run_detail
 from orchestrator.console.lineage import drawing
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
+from orchestrator.console.run_parts import evaluations_of
 from orchestrator.console.submit_fields import written
 from orchestrator.domain.errors import ClientError
 from shared_store.volume.files import DamagedFile
@@ -37,8 +39,6 @@ def model(
     chosen = found["version"]
     shown = sorted({*found["versions"][-_MOST_VERSIONS:], chosen})
     versions = [found if each == chosen else _version(request, name, each) for each in shown]
-    graph = drawing([each for each in versions if each], chosen, lambda run: _parent(request, run), _link)
-    evaluations = [_evaluation(each) for each in found.get("evaluations") or []]
     facts = {
         "Task": found.get("task"),
         "Algorithm": found.get("algorithm"),
@@ -56,19 +56,12 @@ def model(
         request,
         "model.html",
         model=found,
-        row=_row(found),
-        facts=list(facts.items()),
-        graph=graph,
-        evaluations=evaluations,
-        problem=found.get("problem", ""),
-        verified=found.get("verified", False),
+        facts=facts.items(),
+        graph=drawing([each for each in versions if each], chosen, partial(_parent, request)),
+        evaluations=evaluations_of(found.get("evaluations") or [], ""),
         spec=written(found["spec"]) if isinstance(found.get("spec"), dict) else "",
-        contract=_contract(found.get("contract")),
+        contract=_contract(found.get("contract")).items(),
     )
-
-
-def _link(run: str) -> str:
-    return f"/runs/{run}"
 
 
 def _version(request: Request, name: str, version: int) -> Mapping[str, Any] | None:
@@ -90,49 +83,32 @@ def _parent(request: Request, run: str) -> Mapping[str, Any] | None:
 
 
 def _row(model: Mapping[str, Any]) -> dict[str, Any]:
-    registered = model.get("registered")
+    """A model of the list; one that is damaged has only its name, version and problem."""
     own = [each for each in model.get("evaluations") or [] if not each.get("config")]
     best = max(own, key=lambda each: each["episodes"], default=None)
     return {
-        "name": model["name"],
-        "version": model["version"],
-        "task": model.get("task") or "",
-        "run": model.get("run") or "",
-        "iteration": model.get("iteration", ""),
+        **{
+            key: model.get(key) or ""
+            for key in ("name", "version", "task", "run", "iteration", "registered", "problem")
+        },
         "return": _number(best["mean_return"] if best else model.get("score")),
-        "registered": int(registered * 1000) if isinstance(registered, int | float) else None,
-        "problem": model.get("problem", ""),
     }
 
 
-def _evaluation(each: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        "name": each.get("name"),
-        "return": _number(each["mean_return"]),
-        "length": f"{each['mean_length']:.1f} of {each['max_length']}",
-        "episodes": each["episodes"],
-        "seed": each.get("seed"),
-        "changes": written(each["config"]).strip() if each.get("config") else "",
-        "time": int(each["time"] * 1000),
-    }
-
-
-def _contract(contract: Any) -> list[tuple[str, str]]:
+def _contract(contract: Any) -> dict[str, str]:
     """The policy's inputs and outputs, in a few words."""
     if not isinstance(contract, Mapping):
-        return []
-    seen = {
-        f"Observations: {group['name']}": _named(group.get("terms")) or " × ".join(map(str, group["shape"]))
-        for group in contract.get("groups") or ()
-    }
-    facts = {
+        return {}
+    return {
         "Control rate": f"{contract.get('control_hz'):g} Hz",
-        **seen,
+        **{
+            f"Observations: {group['name']}": _named(group.get("terms")) or " × ".join(map(str, group["shape"]))
+            for group in contract.get("groups") or ()
+        },
         "Actions": ", ".join(map(str, contract.get("action_names") or ())),
         "Commands": _named(contract.get("commands")),
         "Recurrent state": _named(contract.get("states")),
     }
-    return list(facts.items())
 
 
 def _named(parts: Any) -> str:

@@ -15,17 +15,19 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined, select_autoes
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.auth import error_response, session_of
 from orchestrator.api.http.requests import actor_of
-from orchestrator.console import assets
-from orchestrator.console import formats as words
+from orchestrator.console import assets, formats
+from orchestrator.domain.reasons import short_id, title
 from orchestrator.services.permissions import Actor
 from shared_store import __version__
+from shared_store.contract.error_text import counted
 from shared_store.contract.plugins import PluginError, load, plugins
 
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; frame-src 'self'; "
-    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types 'none'"
+    "form-action 'self'; base-uri 'none'; frame-ancestors 'none'; require-trusted-types-for 'script'; trusted-types fragments"
 )
-"""Content-Security-Policy of every page: its own files and nothing else, nothing inline, and no text that becomes markup by a script."""
+"""Content-Security-Policy of every page: its own files and nothing else, nothing inline; of its scripts, only ``static/live.js`` makes markup,
+of the fragments that the server rendered."""
 _HEADERS = {
     "Content-Security-Policy": POLICY,
     "Cache-Control": "no-store",
@@ -81,37 +83,52 @@ templates = Environment(
     lstrip_blocks=True,
     auto_reload=False,
 )
-templates.globals |= {"asset": assets.url, "version": __version__, "bound": words.bound}
-templates.filters |= {
-    "ago": words.ago,
-    "count": words.count,
-    "moment": words.moment,
-    "since": words.since,
-    "duration": words.duration,
+templates.globals |= {"asset": assets.url, "version": __version__}
+_FORMATS = (
+    "age",
+    "amounts",
+    "cost",
+    "count",
+    "duration",
+    "interval",
+    "moment",
+    "nodes",
+    "ran",
+    "size",
+    "spark",
+    "with_error",
+)
+templates.filters |= {name: getattr(formats, name) for name in _FORMATS} | {
+    "counted": counted,
+    "short_id": short_id,
+    "title_of": title,
 }
 
 
 def render(request: Request, template: str, status: int = 200, frame: str = "", **values: Any) -> HTMLResponse:
-    """A page of ``templates/``, with the parts that all pages show: who is looking, the navigation, the theme, the form's token.
+    """A page of ``templates/``.
 
     ``frame``: the one other origin whose page it shows in a frame.
     """
-    actor = actor_of(request)
-    theme = request.cookies.get(THEME)
-    shared: dict[str, Any] = {
+    text = templates.get_template(template).render(shared(request) | values)
+    headers = dict(_HEADERS)
+    if frame:
+        headers["Content-Security-Policy"] = POLICY.replace("frame-src 'self'", f"frame-src 'self' {frame}")
+    return HTMLResponse(text, status, headers)
+
+
+def shared(request: Request) -> dict[str, Any]:
+    """What all pages show: who is looking, the navigation, the theme, the form's token."""
+    actor, theme = actor_of(request), request.cookies.get(THEME)
+    return {
         "actor": actor,
         "may_change": may_change(actor),
-        "navigation": _navigation(request),
+        "navigation": _navigation(actor),
         "here": request.url.path,
         "theme": theme if theme in ("light", "dark") else "",
         "form_token": form_token(request),
         "has_session": bool(session(request)),
     }
-    text = templates.get_template(template).render(shared | values)
-    headers = dict(_HEADERS)
-    if frame:
-        headers["Content-Security-Policy"] = POLICY.replace("frame-src 'self'", f"frame-src 'self' {frame}")
-    return HTMLResponse(text, status, headers)
 
 
 def may_change(actor: Actor) -> bool:
@@ -132,9 +149,8 @@ def session(request: Request) -> str:
     return given if access.session(given) is not None else ""
 
 
-def _navigation(request: Request) -> list[NavigationEntry]:
+def _navigation(actor: Actor) -> list[NavigationEntry]:
     """The entries, without those whose pages would be refused."""
-    actor = actor_of(request)
     refused = set() if may_change(actor) else {"/submit"}
     if actor.queues is not None:
         refused.add("/keys")

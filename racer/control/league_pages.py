@@ -14,11 +14,10 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.job_list import Wanted, page_of_jobs
 from orchestrator.api.native.model_routes import list_models
 from orchestrator.console.forms import Form, Question, body_of, done, sent_form
-from orchestrator.console.live import Recent, TableRows, stream
+from orchestrator.console.live import LiveParts, Recent, Table, stream
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
-from orchestrator.domain.job import Status
 from racer.control import leagues as cases
 from racer.control.leagues import LEAGUE_TAG, MODEL_TAG
 from racer.control.submit_form import FORM
@@ -86,8 +85,7 @@ def league(request: Request, name: str, every: bool = Query(default=False)) -> R
         rows=rows,
         every=every,
         models=models,
-        races=list(_races(request, name).values()),
-        blank=_race({}, ""),
+        races=_races(request, name),
     )
 
 
@@ -95,10 +93,9 @@ def league(request: Request, name: str, every: bool = Query(default=False)) -> R
 def race_stream(request: Request, name: str) -> Response:
     """The changes in the list of races, as events."""
     actor = actor_of(request)
-    rows = TableRows()
     look = partial(_races, request, name)
-    cases.read_league(controller_of(request), name)
-    return stream(request, lambda: rows.changes(_recent.get((actor, name), look), {}), _INTERVAL, stored=True)
+    live = LiveParts(request, "league_live.html", league=cases.read_league(controller_of(request), name))
+    return stream(request, lambda: live.changes({"races": _recent.get((actor, name), look)}), _INTERVAL, stored=True)
 
 
 @router.post("/leagues/{name}/races")
@@ -216,29 +213,15 @@ def _rules(league: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _races(request: Request, name: str) -> dict[str, dict[str, Any]]:
+def _races(request: Request, name: str) -> Table:
     """The newest races of a league that the caller may see, by job, without those that are entered."""
     controller, actor = controller_of(request), actor_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
     jobs = page_of_jobs(controller, actor, Wanted(search=begins), _READ)["jobs"]
     if not jobs:
-        return {}
+        return Table()
     described = batch.call(controller, actor, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]
     tags = {each["jobId"]: each.get("tags") or {} for each in described}
     entered = cases.entered_jobs(controller_of(request), name)
     ours = [job for job in jobs if tags.get(job["id"], {}).get(LEAGUE_TAG) == name and job["id"] not in entered]
-    return {job["id"]: _race(job, str(tags[job["id"]].get(MODEL_TAG))) for job in ours[:_RACES]}
-
-
-def _race(job: Mapping[str, Any], model: str) -> dict[str, Any]:
-    """The texts of a race's row; all empty for the row that scripts copy."""
-    status = job.get("status", "")
-    return {
-        "id": job.get("id", ""),
-        "short": job.get("id", "")[:8],
-        "link": f"/jobs/{job['id']}" if job else "/",
-        "model": model,
-        "status": status,
-        "reason": (job.get("statusReason") or "") if status != Status.SUCCEEDED else "",
-        "driven": "yes" if status == Status.SUCCEEDED else "",
-    }
+    return Table((job["id"], {**job, "model": str(tags[job["id"]].get(MODEL_TAG))}) for job in ours[:_RACES])

@@ -25,7 +25,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Serving]:
 
 def newest(person: Person) -> int:
     """The iteration of the newest checkpoint in the table, which is marked here."""
-    row = person.page.locator("[data-checkpoints] tr[data-key]").first
+    row = person.page.locator("#checkpoints tr[data-key]").first
     row.get_by_role("radio").check()
     return int(row.locator("td").nth(1).inner_text())
 
@@ -45,7 +45,7 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     person.leave("Evaluate")
     ended(person)
     page.goto(f"/jobs/{job}")
-    expect(page.locator("[data-checkpoints] tr[data-key]").first.locator("td").nth(3)).not_to_be_empty()
+    expect(page.locator("#checkpoints tr[data-key]").first.locator("td").nth(3)).not_to_be_empty()
     newest(person)
     person.leave("Export")
     ended(person)
@@ -90,13 +90,13 @@ def reads_the_log(person: Person) -> None:
 
 def saves_and_stops(person: Person) -> None:
     person.click("Save a checkpoint now")
-    expect(person.page.locator("[data-checkpoints] tr[data-key]").first).to_be_visible()
+    expect(person.page.locator("#checkpoints tr[data-key]").first).to_be_visible()
     person.click("Stop")
     person.confirm()
     expect(state_of(person)).to_have_text("FAILED")
     expect(person.page.locator(".headline .why")).to_contain_text("stopped in the console by")
     expect(person.page.get_by_role("log").locator(".line").last).to_contain_text("node 0 ended")
-    expect(person.page.locator("[data-attempts] .span").first).to_have_attribute("data-state", "stopped")
+    expect(person.page.locator("#attempts .span").first).to_have_attribute("data-state", "stopped")
 
 
 def resumes(person: Person) -> str:

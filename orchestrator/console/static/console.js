@@ -1,6 +1,6 @@
 // What every page has: live parts, times, forms, the theme.
 import { startForms, showKept } from "./forms.js";
-import { startTables } from "./live.js";
+import { startLive } from "./live.js";
 import { startTheme } from "./theme.js";
 import { startTimes } from "./times.js";
 
@@ -8,4 +8,4 @@ startTheme();
 startTimes();
 startForms();
 showKept();
-startTables();
+startLive();

@@ -1,28 +1,38 @@
 // Charts of curves, as SVG: the server sends few points, and the page's own styles give them their colours. See the docstring of
 // orchestrator/console/curves.py.
+import { show } from "./forms.js";
+
 const SVG = "http://www.w3.org/2000/svg";
 const [WIDTH, HEIGHT] = [600, 220];
 const [LEFT, RIGHT, TOP, BOTTOM] = [62, 10, 8, 40];
 const COLOURS = 6;
-let counted = 0;
+const POINTS = 300;
+const MOST = 3 * POINTS;
+const RANK = "rank_collect_seconds/";
+const AXES = ["env_steps", "total_seconds"];
+const HIDDEN = new Set([...AXES, "time", "iteration_seconds", "slowest_rank", "score_error", "iteration"]);
+let clips = 0;
 
-/**
- * Read a window of a run's curves.
- * @param {string} address
- * @param {{names?: string[], from?: number, to?: number, points?: number}} window
- * @returns {Promise<{iterations: number[], series: Object<string, (number|null)[]>, last: number}>}
- */
-export async function read(address, { names = [], from, to, points } = {}) {
-  const url = new URL(address, location.origin);
-  for (const name of names) url.searchParams.append("name", name);
-  for (const [name, value] of Object.entries({ from, to, points })) if (value != null) url.searchParams.set(name, value);
-  const answer = await fetch(url, { headers: { Accept: "application/json" } });
-  if (!answer.ok) throw new Error((await answer.json().catch(() => ({}))).message ?? `${answer.status}`);
-  return answer.json();
+/** The charts of a run, by label: which metrics each has. `labels`: of the algorithms' metrics. */
+function groupsOf(labels) {
+  const one = (label, ...names) => ({ label, fits: (name) => names.includes(name) });
+  return [
+    one("Reward", "reward", "score"),
+    { label: "Reward terms", fits: (name) => name.startsWith("reward_") },
+    one("Episode length", "episode_length"),
+    one("Success", "success"),
+    { label: "How episodes end", fits: (name) => name.startsWith("termination_") },
+    { label: "Losses", fits: (name) => name.endsWith("_loss") || name === "loss" },
+    ...Object.entries(labels).map(([name, label]) => one(label, name)),
+    one("Environment steps per second", "steps_per_second"),
+    { ...one("Simulation, learning and saving [s per iteration]", "collect_seconds", "learn_seconds", "stall_seconds"), isStacked: true },
+    { label: "Simulation of each rank [s per iteration]", fits: (name) => name.startsWith(RANK) },
+    one("Slowest rank [share over the median]", "slowest_excess"),
+  ];
 }
 
 /** A number as a person reads it, in about four digits. */
-export function shown(value) {
+function shown(value) {
   if (value == null) return "–";
   const size = Math.abs(value);
   if (size && (size >= 1e5 || size < 1e-3)) return value.toExponential(2).replace("e+", "e");
@@ -30,7 +40,7 @@ export function shown(value) {
 }
 
 /** The exponential mean of values, as TensorBoard's smoothing has it; weight: 0 is none. */
-export function smoothed(values, weight) {
+function smoothed(values, weight) {
   if (!weight) return values;
   let mean = 0;
   let total = 0;
@@ -54,7 +64,7 @@ export class Chart {
     this.picture = drawn("svg", { viewBox: `0 0 ${WIDTH} ${HEIGHT}`, role: "img", "aria-label": label, tabindex: "0" });
     this.legend = document.createElement("ul");
     this.legend.className = "legend";
-    this.clip = `clip-${++counted}`;
+    this.clip = `clip-${++clips}`;
     place.replaceChildren(caption, this.picture, this.legend);
     this.#listen();
   }
@@ -73,7 +83,7 @@ export class Chart {
     this.cursor = drawn("line", { class: "cursor", y1: TOP, y2: HEIGHT - BOTTOM, x1: -9, x2: -9 });
     this.brush = drawn("rect", { class: "brush", y: TOP, height: HEIGHT - TOP - BOTTOM, x: 0, width: 0 });
     this.picture.replaceChildren(...parts, group, this.brush, this.cursor);
-    this.#tell(Math.min(this.at, data.x.length - 1));
+    this.#point(Math.min(this.at, data.x.length - 1));
   }
 
   #frame(label) {
@@ -84,12 +94,12 @@ export class Chart {
     for (const value of ticks(...this.ys, 4)) {
       const y = this.#y(value);
       frame.append(drawn("line", { x1: LEFT, x2: WIDTH - RIGHT, y1: y, y2: y }));
-      frame.append(written(shown(value), { x: LEFT - 6, y: y + 4, "text-anchor": "end" }));
+      frame.append(drawn("text", { x: LEFT - 6, y: y + 4, "text-anchor": "end" }, shown(value)));
     }
     for (const value of ticks(...this.xs, 5)) {
-      frame.append(written(shown(value), { x: this.#x(value), y: HEIGHT - BOTTOM + 16, "text-anchor": "middle" }));
+      frame.append(drawn("text", { x: this.#x(value), y: HEIGHT - BOTTOM + 16, "text-anchor": "middle" }, shown(value)));
     }
-    frame.append(written(label, { x: WIDTH - RIGHT, y: HEIGHT - 6, "text-anchor": "end" }));
+    frame.append(drawn("text", { x: WIDTH - RIGHT, y: HEIGHT - 6, "text-anchor": "end" }, label));
     return frame;
   }
 
@@ -97,8 +107,8 @@ export class Chart {
     const { x } = this.data;
     const parts = [];
     if (low && high) {
-      const there = x.map((_, i) => i).filter((i) => low[i] != null && high[i] != null);
-      const edge = [...there.map((i) => [x[i], high[i]]), ...there.reverse().map((i) => [x[i], low[i]])];
+      const known = x.map((_, i) => i).filter((i) => low[i] != null && high[i] != null);
+      const edge = [...known.map((i) => [x[i], high[i]]), ...known.reverse().map((i) => [x[i], low[i]])];
       const points = edge.map(([at, value]) => `${this.#x(at).toFixed(1)},${this.#y(value).toFixed(1)}`).join(" ");
       parts.push(drawn("polygon", { class: `band ${colour(index)}`, points }));
     }
@@ -125,7 +135,7 @@ export class Chart {
   }
 
   /** The values at a point (the last ones where none is marked) beside the names. */
-  #tell(at) {
+  #point(at) {
     this.at = at;
     const { x, xLabel, lines } = this.data;
     const entries = lines.map((line, index) => {
@@ -153,10 +163,10 @@ export class Chart {
     this.picture.addEventListener("pointermove", (event) => {
       if (!this.data?.x.length) return;
       const value = valueAt(event);
-      this.#tell(nearest(this.data.x, value));
+      this.#point(nearest(this.data.x, value));
       if (from !== null) this.#mark(from, value);
     });
-    this.picture.addEventListener("pointerleave", () => this.data?.x.length && this.#tell(-1));
+    this.picture.addEventListener("pointerleave", () => this.data?.x.length && this.#point(-1));
     this.picture.addEventListener("pointerdown", (event) => {
       if (event.pointerType !== "mouse" || !this.data?.x.length) return; // a finger scrolls the page
       from = valueAt(event);
@@ -176,7 +186,7 @@ export class Chart {
       if (!step || !this.data?.x.length) return;
       event.preventDefault();
       const start = this.at < 0 ? this.data.x.length - 1 : this.at + step;
-      this.#tell(Math.min(this.data.x.length - 1, Math.max(0, start)));
+      this.#point(Math.min(this.data.x.length - 1, Math.max(0, start)));
     });
   }
 
@@ -188,6 +198,104 @@ export class Chart {
 
   #choose(detail) {
     this.place.dispatchEvent(new CustomEvent("window", { detail }));
+  }
+}
+
+/** The curves of a run: a window of iterations for all charts, and what comes in as it trains. */
+export class RunCurves {
+  /** @param {HTMLElement} place  of the macro `curves_of` */
+  constructor(place) {
+    this.place = place;
+    this.groups = groupsOf(JSON.parse(place.dataset.labels));
+    this.window = null;
+    this.data = { iterations: [], series: {} };
+    this.last = null;
+    this.charts = new Map();
+    [this.axis, this.smooth, this.whole, this.more] = ["axis", "smooth", "whole", "more"].map((each) => place.querySelector(`[data-${each}]`));
+    for (const choice of [this.axis, this.smooth]) choice.addEventListener("change", () => this.#draw());
+    this.more.addEventListener("toggle", () => this.#draw());
+    this.whole.addEventListener("click", () => this.#choose(null));
+  }
+
+  /** Read the window, thinned by the server. */
+  async load() {
+    const url = new URL(this.place.dataset.curves, location.origin);
+    for (const name of this.place.dataset.metrics.split(" ").filter(Boolean)) url.searchParams.append("name", name);
+    for (const name of url.searchParams.has("name") ? AXES : []) url.searchParams.append("name", name);
+    for (const [name, value] of Object.entries({ ...this.window, points: POINTS })) url.searchParams.set(name, value);
+    try {
+      const response = await fetch(url, { headers: { Accept: "application/json" } });
+      const data = await response.json();
+      if (!response.ok) throw new Error(data.message);
+      this.data = data;
+      this.last = data.last;
+      this.#draw();
+    } catch (error) {
+      show(`the curves can't be read: ${error.message}`, true);
+    }
+  }
+
+  /** Iterations that the stream brought. */
+  add(data) {
+    if (data.again) return this.load();
+    this.last = Math.max(this.last ?? 0, data.iterations.at(-1) ?? 0);
+    if (this.window) return undefined; // the person looks at the past
+    const { iterations, series } = this.data;
+    const fresh = data.iterations.findIndex((each) => each > (iterations.at(-1) ?? 0));
+    if (fresh < 0) return undefined;
+    for (const name of new Set([...Object.keys(series), ...Object.keys(data.series)])) {
+      series[name] ??= iterations.map(() => null);
+      series[name].push(...(data.series[name] ?? data.iterations.map(() => null)).slice(fresh));
+    }
+    iterations.push(...data.iterations.slice(fresh));
+    if (iterations.length > MOST) return this.load();
+    this.#draw();
+    return undefined;
+  }
+
+  #draw() {
+    this.waiting ??= requestAnimationFrame(() => {
+      this.waiting = null;
+      this.#drawNow();
+    });
+  }
+
+  #drawNow() {
+    const names = Object.keys(this.data.series).filter((name) => !HIDDEN.has(name));
+    const rest = names.filter((name) => !this.groups.some((group) => group.fits(name)));
+    this.place.querySelector("[data-no-curves]").hidden = this.data.iterations.length > 0;
+    this.more.hidden = !rest.length;
+    for (const group of this.groups) this.#chart(group, names.filter(group.fits), this.place.querySelector("[data-charts]"));
+    for (const name of this.more.open ? rest : []) this.#chart({ label: name }, [name], this.more.querySelector(".charts"));
+  }
+
+  #chart(group, names, place) {
+    if (!names.length) return;
+    if (!this.charts.has(group.label)) {
+      const figure = document.createElement("figure");
+      place.append(figure);
+      figure.addEventListener("window", (event) => this.#choose(event.detail));
+      this.charts.set(group.label, new Chart(figure, group));
+    }
+    const axis = this.axis.value;
+    const x = AXES.includes(axis) ? this.data.series[axis] ?? [] : this.data.iterations;
+    const weight = Number(this.smooth.value);
+    const lines = names.map((name) => ({ name: name.replace(RANK, "rank "), y: smoothed(this.data.series[name], weight) }));
+    this.charts.get(group.label).draw({ x, xLabel: this.axis.selectedOptions[0].textContent, lines });
+  }
+
+  /** Another window, given in what the charts are drawn against; null: the whole history. */
+  #choose(chosen) {
+    let window = chosen;
+    if (chosen && AXES.includes(this.axis.value)) {
+      const x = this.data.series[this.axis.value];
+      const inside = this.data.iterations.filter((_, i) => x[i] >= chosen.from && x[i] <= chosen.to);
+      if (inside.length < 2) return;
+      window = { from: inside[0], to: inside.at(-1) };
+    }
+    this.window = window;
+    this.whole.hidden = !window;
+    this.load();
   }
 }
 
@@ -227,28 +335,24 @@ function ticks(low, high, count) {
   return found;
 }
 
-function nearest(values, wanted) {
+function nearest(values, target) {
   let best = 0;
   values.forEach((value, i) => {
-    if (value != null && Math.abs(value - wanted) < Math.abs((values[best] ?? Infinity) - wanted)) best = i;
+    if (value != null && Math.abs(value - target) < Math.abs((values[best] ?? Infinity) - target)) best = i;
   });
   return best;
 }
 
-function drawn(name, attributes) {
+/** An element of an SVG. */
+function drawn(name, attributes, text = "") {
   const element = document.createElementNS(SVG, name);
   for (const [key, value] of Object.entries(attributes)) element.setAttribute(key, value);
-  return element;
-}
-
-function written(text, attributes) {
-  const element = drawn("text", attributes);
-  element.textContent = text;
+  element.append(text);
   return element;
 }
 
 function made(name, text) {
   const element = document.createElement(name);
-  element.textContent = text;
+  element.append(text);
   return element;
 }

@@ -1,17 +1,18 @@
 // Live parts of a page, over one stream of server-sent events. A hidden page closes its stream, since a browser opens only six
 // connections to a server, and continues after the last event that it has.
-import { fill } from "./bind.js";
+import { renewTimes } from "./times.js";
 
 const AGAIN = 3000;
 const PATIENCE = 5000;
+const FRAGMENTS = globalThis.trustedTypes?.createPolicy("fragments", { createHTML: (text) => text });
 
 /**
- * Follow a stream until it ends.
+ * Follow a stream until it ends. Its event `parts` renews parts of the page.
  * @param {string} address  of this server
- * @param {Object<string, function(any, string): void>} handlers  by name of event: called with its data and its id
+ * @param {Object<string, function(any): void>} handlers  by name of other events: called with their data
  * @returns {{close: function(): void}}
  */
-export function subscribe(address, handlers) {
+export function subscribe(address, handlers = {}) {
   let source = null;
   let last = "";
   let hiding = 0;
@@ -22,16 +23,14 @@ export function subscribe(address, handlers) {
     const url = new URL(address, location.origin);
     if (last) url.searchParams.set("last", last);
     source = new EventSource(url);
-    source.onopen = () => tell("");
+    source.onopen = () => report("");
     source.onerror = lost;
-    for (const [name, handle] of Object.entries(handlers)) {
+    for (const [name, handle] of Object.entries({ parts: renew, trouble: report, ...handlers, end: close })) {
       source.addEventListener(name, (event) => {
         if (event.lastEventId) last = event.lastEventId;
-        handle(JSON.parse(event.data), event.lastEventId);
+        handle(JSON.parse(event.data));
       });
     }
-    source.addEventListener("trouble", (event) => tell(JSON.parse(event.data)));
-    source.addEventListener("end", close);
   }
 
   function pause() {
@@ -42,11 +41,11 @@ export function subscribe(address, handlers) {
   function close() {
     isOver = true;
     pause();
-    tell("");
+    report("");
   }
 
   function lost() {
-    tell("connection lost; trying again");
+    report("connection lost; trying again");
     if (source?.readyState !== EventSource.CLOSED) return; // the browser itself tries again
     pause();
     setTimeout(returned, AGAIN);
@@ -54,14 +53,10 @@ export function subscribe(address, handlers) {
 
   async function returned() {
     try {
-      const answer = await fetch(location.href, {
-        method: "HEAD",
-        redirect: "manual",
-        headers: { Accept: "text/html" },
-      });
-      if (answer.type === "opaqueredirect") return location.reload(); // to the login
+      const response = await fetch(location.href, { method: "HEAD", redirect: "manual", headers: { Accept: "text/html" } });
+      if (response.type === "opaqueredirect") return location.reload(); // to the login
     } catch {
-      // the server is still away
+      // the server is still unavailable
     }
     open();
   }
@@ -77,46 +72,71 @@ export function subscribe(address, handlers) {
   return { close };
 }
 
-function tell(text) {
+function report(text) {
   const place = document.querySelector("[data-link]");
-  if (!place) return;
   place.textContent = text;
   place.hidden = !text;
 }
 
-/** Start every table of the page that has `data-live`. */
-export function startTables() {
-  for (const region of document.querySelectorAll("[data-live]")) {
-    subscribe(region.dataset.live, { rows: (data) => renew(region, data) });
-  }
+/** Start the live parts of a page that has no script of its own for them. */
+export function startLive() {
+  const place = document.querySelector("[data-live]");
+  if (place) subscribe(place.dataset.live);
 }
 
-/** Renew a live table by an event of `orchestrator.console.live.Rows`. */
-export function renew(region, data) {
-  const body = region.querySelector("[data-rows]");
-  const blank = region.querySelector("[data-blank]");
+/** Renew parts of the page by an event of `orchestrator.console.live.LiveParts`. */
+function renew(parts) {
+  for (const [id, part] of Object.entries(parts)) {
+    const place = document.getElementById(id);
+    if (id === "page" && part !== document.querySelector("[data-page]").dataset.page) location.reload();
+    else if (!place) continue;
+    else if (typeof part === "string") patchChildren(place, fragment(part));
+    else renewTable(place, part);
+  }
+  renewTimes();
+}
+
+function renewTable(place, { order, rows }) {
+  const body = place.querySelector("[data-rows]");
   const known = new Map([...body.children].map((row) => [row.dataset.key, row]));
-  for (const [key, fields] of Object.entries(data.rows ?? {})) {
-    let row = known.get(key);
-    if (!row) {
-      row = blank.content.firstElementChild.cloneNode(true);
-      row.dataset.key = key;
-      known.set(key, row);
-    }
-    fill(row, fields);
+  for (const [key, markup] of Object.entries(rows)) {
+    const fresh = fragment(markup).firstElementChild;
+    if (known.has(key)) patch(known.get(key), fresh);
+    else known.set(key, fresh);
   }
-  if (data.order) arrange(body, data.order.map((key) => known.get(key)).filter(Boolean));
-  if (data.totals) for (const place of document.querySelectorAll("[data-total]")) fill(place, data.totals);
-  const empty = region.querySelector("[data-empty]");
-  if (empty) empty.hidden = body.childElementCount > 0;
-  region.dispatchEvent(new CustomEvent("renewed"));
+  if (!order) return;
+  const keys = new Set(order);
+  for (const [key, row] of known) if (!keys.has(key)) row.remove();
+  order.forEach((key, index) => {
+    // a row that is in its place is not touched, and keeps the focus
+    if (body.children[index] !== known.get(key)) body.insertBefore(known.get(key), body.children[index] ?? null);
+  });
+  place.querySelector("[data-empty]").hidden = order.length > 0;
 }
 
-/** The rows in this order; one that is in its place is not touched, and keeps the focus. */
-function arrange(body, rows) {
-  const wanted = new Set(rows);
-  for (const row of [...body.children]) if (!wanted.has(row)) row.remove();
-  rows.forEach((row, index) => {
-    if (body.children[index] !== row) body.insertBefore(row, body.children[index] ?? null);
+/** Markup that the server rendered. */
+function fragment(markup) {
+  const template = document.createElement("template");
+  template.innerHTML = FRAGMENTS?.createHTML(markup) ?? markup;
+  return template.content;
+}
+
+/** Make an element like a fresh one. What both have stays, and with it the focus, marks and typed texts. */
+function patch(old, fresh) {
+  for (const { name } of [...old.attributes]) if (!fresh.hasAttribute(name)) old.removeAttribute(name);
+  for (const { name, value } of fresh.attributes) if (old.getAttribute(name) !== value) old.setAttribute(name, value);
+  patchChildren(old, fresh);
+}
+
+function patchChildren(old, fresh) {
+  if (old.dataset?.since !== undefined) return; // times.js writes it
+  const [before, after] = [[...old.childNodes], [...fresh.childNodes]];
+  after.forEach((node, index) => {
+    const same = before[index];
+    if (!same) old.append(node);
+    else if (same.nodeName !== node.nodeName) same.replaceWith(node);
+    else if (node instanceof Element) patch(same, node);
+    else if (same.data !== node.data) same.data = node.data;
   });
+  for (const each of before.slice(after.length)) each.remove();
 }

@@ -14,16 +14,14 @@ export function duration(seconds) {
   return parts.slice(0, 2).filter(([amount]) => amount).map((part) => part.join(" ")).join(" ");
 }
 
-function renew() {
-  if (document.hidden) return;
+export function renewTimes() {
   for (const place of document.querySelectorAll("time[data-since]")) {
-    const moment = Date.parse(place.getAttribute("datetime"));
-    const text = Number.isNaN(moment) ? "" : duration((Date.now() - moment) / 1000);
+    const text = duration((Date.now() - Date.parse(place.getAttribute("datetime"))) / 1000);
     if (place.textContent !== text) place.textContent = text;
   }
 }
 
 export function startTimes() {
-  renew();
-  setInterval(renew, 1000);
+  renewTimes();
+  setInterval(() => document.hidden || renewTimes(), 1000);
 }

@@ -19,7 +19,7 @@ def test_an_edited_reward_function_is_checked_trained_and_raced_in_a_league(serv
     corrects_the_reward_function(person)
     job = ended(person)
     page = person.page
-    expect(page.locator("[data-checkpoints] tr[data-key]").first).to_be_visible()
+    expect(page.locator("#checkpoints tr[data-key]").first).to_be_visible()
     person.leave("Export")
     ended(person)
     page.goto(f"/jobs/{job}")

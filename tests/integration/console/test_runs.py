@@ -64,7 +64,7 @@ def store(console: Console) -> Store:
 
 
 def names(page: Page) -> list[str]:
-    return [str(each["value"]) for each in page.all("input", name="run", type="checkbox") if each.get("value")]
+    return [str(each["value"]) for each in page.all("input", name="run", type="checkbox")]
 
 
 def test_the_list_has_every_run_with_its_task_and_best_evaluation(console: Console, store: Store) -> None:
@@ -74,7 +74,7 @@ def test_the_list_has_every_run_with_its_task_and_best_evaluation(console: Conso
     assert "Cartpole" in page.text and "25.2 at 9" in page.text and "key admin" in page.text
     assert names(console.visitor().page("/runs?search=FAST")) == ["fast", "fast-b"]
     assert names(console.visitor().page("/runs?after=fast-b")) == ["labs", "sure"]
-    assert "No run is called like this" in console.visitor().page("/runs?search=nothing").text
+    assert "No run matches" in console.visitor().page("/runs?search=nothing").text
     assert [each["run"] for each in console.client.get("/api/runs", search="fast")] == ["fast", "fast-b"]
 
 
@@ -84,7 +84,7 @@ def test_the_page_of_a_run_has_checkpoints_evaluations_and_lineage(console: Cons
     table = console.visitor().http.get("/runs/sure/files/evaluations/00000009-e1-job.parquet")
     assert page.all("a", href=table.url.path) and table.content[:4] == b"PAR1"
     assert page.all("a", href="/runs/fast") and "No run was cloned from it" in page.text
-    (curves,) = [each for each in page.all("div") if each.get("data-curves")]
+    (curves,) = [each for each in page.all("section") if each.get("data-curves")]
     assert (curves["data-curves"], curves["data-metrics"]) == ("/runs/sure/curves", "reward kl")
     assert "Learning KL divergence 0.010" in page.text
     parent = console.visitor().page("/runs/fast")
@@ -96,20 +96,19 @@ def test_the_page_of_a_run_has_checkpoints_evaluations_and_lineage(console: Cons
 def test_a_run_that_goes_on_is_renewed(console: Console, store: Store) -> None:
     run = trained(store, "goes-on", [1.0, 2.0], train={"worlds": 7})
     stream = console.visitor().events("/runs/goes-on/stream")
-    first = dict((name, data) for name, data, _ in (next(stream) for _ in range(4)))
-    figures = {"learning": "KL divergence 0.010", "warning": ""}
-    assert first["changed"] == {"iteration": 9, **figures} and first["checkpoints"]["order"] == [
-        "00000009-e1",
-        "00000006-e1",
-    ]
+    _, first, place = next(stream)
+    assert "KL divergence 0.010" in first["facts"] and json.loads(place)["i"] == 9
+    assert first["checkpoints"]["order"] == ["00000009-e1", "00000006-e1"]
     with MetricsWriter(run, 1, 9) as metrics:
         figures = {"explained_variance": 0.5, "gradient_norm": 12.0, "warnings": ["it unlearns: (RUN@best)"]}
         metrics.write({"iteration": 10, "env_steps": 1000, "reward": 1.0, **figures})
-    texts = {"learning": "explained variance 0.50, gradient norm 12", "warning": "it unlearns: (goes-on@best)"}
-    assert next(stream)[:2] == ("changed", {"iteration": 10, **texts})
+    found = {name: data for name, data, _ in (next(stream), next(stream))}
+    assert "explained variance 0.50, gradient norm 12" in found["parts"]["facts"]
+    assert "it unlearns: (goes-on@best)" in found["parts"]["facts"]
+    assert found["metrics"]["iterations"] == [10] and found["metrics"]["series"]["explained_variance"] == [0.5]
     add_checkpoint(store, "goes-on", 10)
-    name, data, _ = next(stream)
-    assert name == "checkpoints" and data["order"][0] == "00000010-e1"
+    _, data, _ = next(stream)
+    assert data["checkpoints"]["order"][0] == "00000010-e1"
     stream.close()
 
 
@@ -234,7 +233,7 @@ def test_one_key_has_a_hundred_streams_at_most_and_another_one_when_one_ends(con
         refused = begun()
         assert "event: trouble" in refused and "follows 100 logs and pages already" in refused
         one.close()
-        wait_for(lambda: "event: rows" in begun(), 30, "the place of the one that ended")
+        wait_for(lambda: "event: parts" in begun(), 30, "the place of the one that ended")
 
 
 def test_those_who_wait_for_a_turn_are_few_and_the_others_are_refused_at_once() -> None:

@@ -14,8 +14,9 @@ import pytest
 from fastapi import Request
 
 from orchestrator.api.http.access import Access
-from orchestrator.console import job, live
-from orchestrator.console.live import Recent, ServerSentEvent, TableRows, last_id, stream
+from orchestrator.console import curves, live
+from orchestrator.console.curves import NewIterations
+from orchestrator.console.live import LiveParts, Recent, ServerSentEvent, Table, last_id, stream
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run, Store
@@ -44,15 +45,29 @@ def written(looks: Sequence[Callable[[], Sequence[ServerSentEvent] | None]]) -> 
     return asyncio.run(read()).split("\n\n")[:-1]
 
 
-def test_of_a_table_only_what_changed_is_sent() -> None:
-    table = TableRows()
-    (first,) = table.changes({"a": {"x": "1", "y": "2"}, "b": {"x": "3", "y": "4"}}, {"shown": "2"})
-    assert first.data["order"] == ["a", "b"] and first.data["rows"]["b"] == {"x": "3", "y": "4"}
-    assert table.changes({"a": {"x": "1", "y": "2"}, "b": {"x": "3", "y": "4"}}, {"shown": "2"}) == []
-    (second,) = table.changes({"b": {"x": "3", "y": "5"}, "a": {"x": "1", "y": "2"}}, {"shown": "2"})
-    assert second.data == {"order": ["b", "a"], "rows": {"b": {"y": "5"}}}
-    (third,) = table.changes({"c": {"x": "6"}}, {"shown": "1"})
-    assert third.data == {"order": ["c"], "rows": {"c": {"x": "6"}}, "totals": {"shown": "1"}}
+def test_of_the_parts_of_a_page_only_what_changed_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    macros = SimpleNamespace(
+        jobs=lambda row: f"<tr>{row}</tr>", tabs=lambda found: f"{found % 10} <time data-since>{found}</time>"
+    )
+    template = SimpleNamespace(make_module=lambda values: macros)
+    monkeypatch.setattr(live, "shared", lambda request: {})
+    monkeypatch.setattr(live, "templates", SimpleNamespace(get_template=lambda name: template))
+    parts = LiveParts(request_of(), "jobs_live.html")
+
+    def sent(found: int, **rows: int) -> Any:
+        return [event.data for event in parts.changes({"jobs": Table(rows), "tabs": found})]
+
+    rows = {"a": "<tr>1</tr>", "b": "<tr>2</tr>"}
+    assert sent(3, a=1, b=2) == [{"jobs": {"order": ["a", "b"], "rows": rows}, "tabs": "3 <time data-since></time>"}]
+    assert sent(3, a=1, b=2) == []
+    assert sent(13, a=1, b=2) == [], "how long something is past is written by the page"
+    assert sent(4, b=3, a=1) == [
+        {"jobs": {"order": ["b", "a"], "rows": {"b": "<tr>3</tr>"}}, "tabs": "4 <time data-since></time>"}
+    ]
+    assert sent(4, b=3) == [{"jobs": {"order": ["b"], "rows": {}}}]
+    assert sent(4, b=3, a=1) == [{"jobs": {"order": ["b", "a"], "rows": {"a": "<tr>1</tr>"}}}], (
+        "the page has dropped it"
+    )
 
 
 def test_no_text_can_end_an_event_or_begin_another() -> None:
@@ -138,7 +153,7 @@ def test_an_iteration_that_is_written_between_two_looks_at_the_run_is_sent_once(
             metrics.write({"iteration": found[-1]["iteration"] + 1})
             return found
 
-        monkeypatch.setattr(job, "sampled", look)
-        feed = job._Feed(None, cast(Any, None), run, iteration=0)
-        sent = [event.data["iterations"] for _ in range(3) for event in feed._curves()]
+        monkeypatch.setattr(curves, "sampled", look)
+        new = NewIterations(run, 0)
+        sent = [event.data["iterations"] for _ in range(3) for event in new.changes()]
     assert sent == [[1, 2], [3, 4]]
