@@ -210,14 +210,14 @@ def test_pages_that_wait_for_the_store_say_so_and_the_others_stay_live(server: S
         job = submit_gang(client, CHATTING, env={"MUSTER_RUN": "running"})
         await_status(client, job, "RUNNING")
         waiting = [threads.submit(first_event, server, f"/jobs/{job}/stream", "trouble") for _ in range(2)]
-        assert all(first_event(server, f"/jobs/{job}/stream", "facts") for _ in range(2))
+        assert all(first_event(server, f"/jobs/{job}/stream", "parts") for _ in range(2))
         assert first_line(server, job), "the directory of its log is there"
         with stalled(*hanging(server.store.run("running"))):
             followers = [threads.submit(first_line, server, job) for _ in range(THREADS)]
             assert all("has not answered for 5 s" in each.result() for each in waiting)
             wait_for(lambda: server.controller.access.followed.open >= THREADS, 30, "looks that hang")
-            for path, name in (("/queues/stream", "queues"), ("/keys/stream", "rows"), ("/jobs/stream", "rows")):
-                assert first_event(server, path, name)
+            for page in ("queues", "keys", "jobs"):
+                assert first_event(server, f"/{page}/stream", "parts")
         assert all(each.result() for each in followers), "they go on"
         client.batch("TerminateJob", jobId=job, reason="enough")
 

@@ -119,9 +119,7 @@ def store(console: Console) -> Store:
 
 def driven(page: Page) -> list[str]:
     """The jobs of the races that can be entered."""
-    forms = page.all("form", action="/leagues/cup/entries")
-    jobs = [str(each.get("value", "")) for each in page.all("input", name="job")]
-    return [job for form, job in zip(forms, jobs, strict=True) if "hidden" not in form]
+    return [str(each["value"]) for each in page.all("input", name="job")]
 
 
 def test_leagues_are_listed_with_their_rules_and_their_table(console: Console, store: Store) -> None:
@@ -178,12 +176,12 @@ def test_a_model_is_raced_and_its_race_entered_once_it_has_ended(console: Consol
     assert early.status_code == 409 and "only a race that has SUCCEEDED is entered" in early.json()["message"]
     stream = visitor.events("/leagues/cup/stream")
     _, first, _ = next(stream)
-    assert first["order"] == [job] and first["rows"][job]["driven"] == ""
+    assert first["races"]["order"] == [job] and "Enter" not in first["races"]["rows"][job]
     console.client.batch("TerminateJob", jobId=job, reason=HOSTILE)
-    changed: dict[str, str] = {}
-    while changed.get("status") != "FAILED":
-        changed |= next(stream)[1].get("rows", {}).get(job, {})
-    assert changed["reason"] == HOSTILE
+    row = Page("")
+    while "FAILED" not in row.text:
+        row = Page(next(stream)[1].get("races", {"rows": {}})["rows"].get(job, row.source))
+    assert HOSTILE in row.text and row.is_inert
     stream.close()
     await_status(console.client, job, "FAILED")
     page = visitor.page("/leagues/cup")
@@ -232,6 +230,6 @@ def test_a_race_is_listed_beside_many_newer_jobs_of_a_like_name(console: Console
     definition = console.register("waits")
     others = [console.submit(definition, f"race-tea-time-{i}") for i in range(21)]
     page = visitor.page("/leagues/tea")
-    (job,) = [str(each.get("value")) for each in page.all("input", name="job") if each.get("value")]
+    (job,) = [str(each["data-key"]) for each in page.all("tr") if "data-key" in each]
     for each in (job, *others):
         console.client.batch("TerminateJob", jobId=each, reason="seen")
