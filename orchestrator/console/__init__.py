@@ -15,19 +15,20 @@ How to add a page
            found = page_of_things(controller_of(request), search)        # a use case of the API; it raises ClientError
            return render(request, "things.html", things=found)
 
-   ``page_router`` (:mod:`orchestrator.console.routing`) turns a ClientError into a page (or JSON for a script), and refuses changes without the form's token
-   and addresses with a parameter twice.
-   Plain ``def`` functions run in a thread, where the database may be used.
-2. **A template** ``templates/things.html`` that extends ``base.html``: blocks ``title``, ``content``, ``scripts``. Its navigation entry
-   is a line of :data:`orchestrator.console.pages.NAVIGATION`. Macros: ``from "parts.html" import badge, action, when, spark, empty``.
-   Everything is escaped; never use ``|safe``. No ``style=`` and no ``on…=``: the Content-Security-Policy forbids them.
+   ``page_router`` (:mod:`orchestrator.console.routing`) turns errors into pages (or JSON for a script), and refuses changes without the
+   form's token and addresses with a parameter twice. Plain ``def`` functions run in a thread, where the database may be used.
+2. **A template** ``templates/things.html`` that extends ``base.html``: blocks ``title``, ``content``, ``scripts``; it formats what the API
+   gives with the macros of ``parts.html`` and the filters of :mod:`orchestrator.console.formats`. Its navigation entry is a line of
+   :data:`orchestrator.console.pages.NAVIGATION`. Everything is escaped; never use ``|safe``. No ``style=`` and no ``on…=``: the
+   Content-Security-Policy forbids them.
 3. **An action**: ``@router.post("/things/{name}/remove")`` with ``form: Form = Depends(sent_form)``. Where something is lost, begin with
-   ``form.confirm(Question(…))``; end with ``done(request, "/things", "removed x")``. In the template: the macro ``action``. Show it only
-   where :func:`orchestrator.console.pages.may_change` says so (``may_change`` in templates).
-4. **Live parts**: ``@router.get("/things/stream")`` returns :func:`orchestrator.console.live.stream` of a function that looks and returns
-   events. In the page, an element with ``data-live="/things/stream"`` and a table whose rows the macro ``live_row`` wrote need no script of
-   their own (``static/live.js``): the server sends texts by field, which are put where ``bound(…)`` said. Other parts import
-   ``subscribe`` from ``static/live.js``. A page has one stream, since browsers open only six connections to a server.
+   ``form.confirm(Question(…))``; end with ``done(request, "/things", "removed x")``. In the template: the macro ``action``, where
+   ``may_change``.
+4. **Live parts**: macros of ``templates/things_live.html``, which the page imports. A table is written by the macro ``live_table``, another
+   part stands in an element whose id is the macro's name. ``@router.get("/things/stream")`` returns
+   :func:`orchestrator.console.live.stream` of ``LiveParts(request, "things_live.html").changes``, which renders the same macros again for
+   what changed. An element with ``data-live="/things/stream"`` needs no script of its own. A page has one stream, since browsers open only
+   six connections to a server.
 5. **Styles**: classes of ``static/console.css`` first; one file a page only where it needs many of its own.
 6. **A test** ``tests/integration/console/test_things.py``: the page by HTTP (``console`` fixture: a client with a session and
    ``submit(path, **fields)``), with hostile names, and as a read-only key; the way by clicking is in the browser's tests.

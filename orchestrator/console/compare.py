@@ -66,7 +66,7 @@ def compare(
         rows=[
             (group.cells(), [(run.name, f"/runs/{quote(run.name, safe='')}") for run in group.runs]) for group in groups
         ],
-        differences=[(sentence(told), told["verdict"]) for told in differences if told],
+        differences=[(sentence(each), each["verdict"]) for each in differences if each],
         first=first.label if first else "",
         given=" ".join(runs),
         metrics=metrics,
@@ -86,8 +86,8 @@ def curves(
     ``low`` and ``high`` are one standard deviation over its runs away; null where a single run has records.
     """
     groups = _groups(request, _chosen(request, runs))
-    there = [curve for group in groups for run in group.runs if (curve := run.curve(metric))]
-    at = spaced(span(there), _POINTS) if there else []
+    found = [curve for group in groups for run in group.runs if (curve := run.curve(metric))]
+    at = spaced(span(found), _POINTS) if found else []
     return {"x": at, "xLabel": "environment steps", "lines": [_line(group, metric, at) for group in groups]}
 
 
@@ -103,27 +103,24 @@ def _line(group: RunGroup, metric: str, at: Sequence[float]) -> dict[str, Any]:
 
 def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
     """The names that the patterns match, in the order of the patterns, which may be separated by spaces. Raises ClientError."""
-    chosen: dict[str, None] = {}
-    known: list[str] | None = None
-    controller, actor = controller_of(request), actor_of(request)
     given = [part for each in patterns for part in each.split()]
-    if len(given) > MOST:
-        raise ClientError(
-            f"these are {len(given)} runs or patterns; {MOST} at most are compared at once, so give fewer"
-        )
-    for pattern in given:
-        if not any(sign in pattern for sign in "*?["):
-            chosen[pattern] = None
-            continue
-        if known is None:
-            known = [run.name for run in visible_runs(controller, actor)]
-        fitting = [name for name in known if fnmatchcase(name, pattern)]
-        if not fitting:
-            raise ClientError(f"no run is called like {pattern[:128]}; the page of runs has their names", 404)
-        chosen |= dict.fromkeys(fitting)
-    if len(chosen) > MOST:
-        raise ClientError(f"these are {len(chosen)} runs; {MOST} at most are compared at once, so give fewer")
+    _check_number(len(given), "runs or patterns")
+    is_pattern = {each: any(sign in each for sign in "*?[") for each in given}
+    controller, actor = controller_of(request), actor_of(request)
+    known = [run.name for run in visible_runs(controller, actor)] if any(is_pattern.values()) else []
+    chosen: dict[str, None] = {}
+    for each in given:
+        matching = [name for name in known if fnmatchcase(name, each)] if is_pattern[each] else [each]
+        if not matching:
+            raise ClientError(f"no run matches {each[:128]}; the page of runs has their names", 404)
+        chosen |= dict.fromkeys(matching)
+    _check_number(len(chosen), "runs")
     return list(chosen)
+
+
+def _check_number(number: int, what: str) -> None:
+    if number > MOST:
+        raise ClientError(f"these are {number} {what}; at most {MOST} are compared at once, so give fewer")
 
 
 def _groups(request: Request, names: Sequence[str]) -> list[RunGroup]:
@@ -136,12 +133,8 @@ def _groups(request: Request, names: Sequence[str]) -> list[RunGroup]:
 def _facts(request: Request, name: str) -> ComparedRun:
     described = run_routes.run_detail(request, name)
     run = permitted_run(controller_of(request), actor_of(request), name, Operation.READ_METRICS)
-    try:
-        records = sampled(run, _RECORDS)
-    except OSError as error:
-        raise ClientError(f"the metrics of run {name} can't be read now: {error.strerror or error}", 503) from None
-    checkpoints = run_routes.run_checkpoints(request, name)
-    return facts_of(described, records, checkpoints, run_routes.run_evaluations(request, name))
+    checkpoints, evaluations = run_routes.run_checkpoints(request, name), run_routes.run_evaluations(request, name)
+    return facts_of(described, sampled(run, _RECORDS), checkpoints, evaluations)
 
 
 def _metrics(groups: Sequence[RunGroup]) -> list[str]:

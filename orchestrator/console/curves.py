@@ -23,7 +23,6 @@ from fastapi import Query, Request
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.console.live import Recent, ServerSentEvent
 from orchestrator.console.routing import page_router
-from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Operation
 from shared_store.volume.layout import Run
@@ -56,10 +55,7 @@ def run_curves(
     """A window of a run's metrics."""
     run = permitted_run(controller_of(request), actor_of(request), name, Operation.READ_METRICS)
     key = (str(run.path), tuple(names), begin, end, points)
-    try:
-        return _recent.get(key, partial(curves_of, run, names, begin, end, points))
-    except OSError as error:
-        raise ClientError(f"the metrics of run {run.name} can't be read now: {error.strerror or error}", 503) from None
+    return _recent.get(key, partial(curves_of, run, names, begin, end, points))
 
 
 def curves_of(

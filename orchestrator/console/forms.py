@@ -58,6 +58,10 @@ class Form:
         """All values of this name."""
         return list(self.fields.get(name, []))
 
+    def repeated(self) -> list[tuple[str, str]]:
+        """Names and values for another form that sends the same."""
+        return [(name, value) for name, values in self.fields.items() for value in values if name != TOKEN]
+
     def confirm(self, question: Question) -> None:
         """Continue only where the person was asked and said yes. Raises Unconfirmed."""
         if self.one("confirmed") != "yes":
@@ -75,8 +79,8 @@ class Unconfirmed(Exception):
         """The question, as a page or for the dialog."""
         if not wants_page(request):
             return JSONResponse({"question": asdict(self.question)}, 409)
-        fields = [(name, value) for name, values in self.form.fields.items() for value in values if name != TOKEN]
-        return render(request, "confirm.html", 409, question=self.question, fields=fields, action=request.url.path)
+        fields, action = self.form.repeated(), request.url.path
+        return render(request, "confirm.html", 409, question=self.question, fields=fields, action=action)
 
 
 async def sent_form(request: Request) -> Form:
@@ -102,9 +106,9 @@ async def check_form(request: Request) -> None:
     """Refuse a change that does not come from a form of this console. Raises Refusal."""
     if request.method in ("GET", "HEAD") or request.url.path == _OPEN:
         return
-    given = request.headers.get("x-form-token") or (await sent_form(request)).one(TOKEN)
-    if not hmac.compare_digest(given.encode(), form_token(request).encode()):
-        raise Refusal("AccessDeniedException", "this form is of another session; load the page again and repeat")
+    token = request.headers.get("x-form-token") or (await sent_form(request)).one(TOKEN)
+    if not hmac.compare_digest(token.encode(), form_token(request).encode()):
+        raise Refusal("AccessDeniedException", "the session has expired; reload the page")
 
 
 def body_of(kind: type[_Body], given: Mapping[str, Any]) -> _Body:

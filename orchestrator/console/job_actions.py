@@ -16,7 +16,8 @@ from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import short_id
 from orchestrator.persistence.batch_models import Job
 from orchestrator.services import clone as clones
-from orchestrator.services import derived_jobs, models
+from orchestrator.services import derived_jobs as jobs
+from orchestrator.services import models
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Operation
@@ -27,7 +28,7 @@ from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.layout import Run
 
 router, _stored = page_router(), page_router(stored=True)
-_Wanted = int | Literal["best", "latest"] | None
+_Marked = int | Literal["best", "latest"] | None
 
 
 @router.post("/jobs/{reference}/stop")
@@ -35,7 +36,7 @@ def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> R
     """Stop the job."""
     actor = actor_of(request)
     job, name, _, _ = _job(request, reference, Operation.TERMINATE_JOB)
-    text = "A training saves a checkpoint before it leaves, and can be resumed. A waiting job is cancelled."
+    text = "A training saves a checkpoint before it ends, and can be resumed. A waiting job is cancelled."
     form.confirm(Question(f"Stop {name}?", text, "Stop"))
     refused = stop_jobs(controller_of(request), actor, [job], f"stopped in the console by {actor.name}")
     if job in refused:
@@ -58,17 +59,17 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
     """Submit a job that continues the run."""
     actor = actor_of(request)
     run, directory = _run(request, reference, Operation.RESUME_RUN)
-    wanted = _checkpoint(form)
-    chosen = choose(run, wanted)
+    marked = _checkpoint(form)
+    chosen = choose(run, marked)
     newest = list_checkpoints(run)[-1:]
     if chosen and newest and chosen.name != newest[0].name:
         text = (
             f"The newest checkpoint is of iteration {newest[0].iteration}. Training after iteration "
-            f"{chosen.iteration} counts no longer, and its curves end there."
+            f"{chosen.iteration} no longer counts, and its curves end there."
         )
         form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
-    iteration = chosen.iteration if chosen and wanted is not None else None
-    changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepted(form) else []))
+    iteration = chosen.iteration if chosen and marked is not None else None
+    changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepts(form) else []))
     answer = resume_job(controller_of(request), actor, run, Changes(iteration, changes, directory))
     return done(request, f"/jobs/{answer['jobId']}", f"resumed {run.name} from iteration {answer['iteration']}")
 
@@ -79,27 +80,27 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
     actor = actor_of(request)
     run, directory = _run(request, reference, Operation.CLONE_RUN)
     name = _named(form, "the new run")
-    told = clones.clone(controller_of(request), actor, run, name, Changes(_checkpoint(form), _changes(form), directory))
-    parent = told["parent"]
-    return done(request, f"/jobs/{told['jobId']}", f"cloned {parent['run']}@{parent['iteration']} as run {told['run']}")
+    changes = Changes(_checkpoint(form), _changes(form), directory)
+    cloned = clones.clone(controller_of(request), actor, run, name, changes)
+    source = f"{cloned['parent']['run']}@{cloned['parent']['iteration']}"
+    return done(request, f"/jobs/{cloned['jobId']}", f"cloned {source} as run {cloned['run']}")
 
 
-@_stored.post("/jobs/{reference}/evaluate")
-def evaluate(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
-    """Submit a job that evaluates a checkpoint."""
-    return _derived(request, derived_jobs.evaluate, reference, form)
+def _add_derived(kind: str, submit: Callable[..., Job]) -> None:
+    """Add the route that submits a job of a kind, which reads a checkpoint, and leads to its page."""
+
+    @_stored.post(f"/jobs/{{reference}}/{kind}")
+    def derived(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
+        run, directory = _run(request, reference, Operation.READ_RUN)
+        if (chosen := choose(run, _checkpoint(form))) is None:
+            raise ClientError(f"run {run.name} has no checkpoint yet; train it first")
+        section = {"checkpoint": chosen.iteration, **({"accept_changed_robot": True} if _accepts(form) else {})}
+        job = submit(controller_of(request), actor_of(request), run, section, directory)
+        return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
 
 
-@_stored.post("/jobs/{reference}/export")
-def export(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
-    """Submit a job that exports a checkpoint's policy."""
-    return _derived(request, derived_jobs.export, reference, form)
-
-
-@_stored.post("/jobs/{reference}/record")
-def record(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
-    """Submit a job that records a checkpoint's policy at work."""
-    return _derived(request, derived_jobs.record, reference, form)
+for _kind, _submit in (("evaluate", jobs.evaluate), ("export", jobs.export), ("record", jobs.record)):
+    _add_derived(_kind, _submit)
 
 
 @_stored.post("/jobs/{reference}/register")
@@ -108,16 +109,8 @@ def register(request: Request, reference: str, form: Form = Depends(sent_form)) 
     run, _ = _run(request, reference, Operation.REGISTER_MODEL)
     controller, actor = controller_of(request), actor_of(request)
     model = models.register(controller, actor, run.name, _named(form, "the model"), _checkpoint(form))
-    told = f"registered {run.name}@{model.facts()['iteration']} as {model.name}@{model.version}"
-    return done(request, f"/jobs/{reference}", told)
-
-
-def _derived(request: Request, submit: Callable[..., Job], reference: str, form: Form) -> Response:
-    """Submit a job that reads a checkpoint, and go to its page. Raises ClientError."""
-    run, directory = _run(request, reference, Operation.READ_RUN)
-    section = {"checkpoint": _iteration(run, form), **_accepted(form)}
-    job = submit(controller_of(request), actor_of(request), run, section, directory)
-    return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
+    message = f"registered {run.name}@{model.facts()['iteration']} as {model.name}@{model.version}"
+    return done(request, f"/jobs/{reference}", message)
 
 
 def _job(request: Request, reference: str, operation: Operation) -> tuple[str, str, str, str]:
@@ -134,7 +127,7 @@ def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, s
     return permitted_run(controller_of(request), actor_of(request), run, operation), directory
 
 
-def _checkpoint(form: Form) -> _Wanted:
+def _checkpoint(form: Form) -> _Marked:
     """The marked checkpoint: an iteration, ``best``, or None for the newest. Raises ClientError."""
     given = form.one("checkpoint")
     if given in ("", "latest"):
@@ -146,17 +139,9 @@ def _checkpoint(form: Form) -> _Wanted:
     raise ClientError(f"checkpoint {given[:50]!r}: expected an iteration, best or latest")
 
 
-def _iteration(run: Run, form: Form) -> int:
-    """Raises ClientError where there is no such checkpoint."""
-    chosen = choose(run, _checkpoint(form))
-    if chosen is None:
-        raise ClientError(f"run {run.name} has no checkpoint yet; train it first")
-    return chosen.iteration
-
-
-def _accepted(form: Form) -> dict[str, bool]:
-    """The key of a job's section that accepts a changed robot, if that is marked."""
-    return {"accept_changed_robot": True} if form.one("accept_changed_robot") else {}
+def _accepts(form: Form) -> bool:
+    """Whether a changed robot is accepted."""
+    return bool(form.one("accept_changed_robot"))
 
 
 def _changes(form: Form) -> tuple[str, ...]:

@@ -40,23 +40,21 @@ def code_of(spec: Mapping[str, Any]) -> list[tuple[str, str]]:
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[tuple[str, str, str]]:
     """Each key whose values differ, with the old and the new one as text; an absent value is empty."""
     before, after = dict(_flattened(old)), dict(_flattened(new))
-    keys = [*after, *(key for key in before if key not in after)]
-    pairs = ((key, before.get(key, _ABSENT), after.get(key, _ABSENT)) for key in keys)
-    return [(key, *_told(was, now)) for key, was, now in pairs if was != now]
+    pairs = ((key, before.get(key, _ABSENT), after.get(key, _ABSENT)) for key in after | before)
+    return [(key, *_both(was, now)) for key, was, now in pairs if was != now]
 
 
-def _told(was: Any, now: Any) -> tuple[str, str]:
+def _both(was: Any, now: Any) -> tuple[str, str]:
     """Two different values; of texts of several lines those that differ, with their numbers."""
-    if not (isinstance(was, str) and isinstance(now, str) and "\n" in was.strip() + now.strip()):
-        return _shown(was), _shown(now)
-    before, after = was.splitlines(), now.splitlines()
-    if max(len(before), len(after)) > _MOST_LINES:
-        return _shown(was), _shown(now)
-    changes = SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
-    spans = [each[1:] for each in changes if each[0] != "equal"]
-    removed = [f"{i + 1}: {before[i]}" for start, stop, _, _ in spans for i in range(start, stop)]
-    added = [f"{i + 1}: {after[i]}" for _, _, start, stop in spans for i in range(start, stop)]
-    return "\n".join(removed), "\n".join(added)
+    if isinstance(was, str) and isinstance(now, str) and "\n" in was.strip() + now.strip():
+        before, after = was.splitlines(), now.splitlines()
+        if max(len(before), len(after)) <= _MOST_LINES:
+            changes = SequenceMatcher(None, before, after, autojunk=False).get_opcodes()
+            spans = [each[1:] for each in changes if each[0] != "equal"]
+            removed = [f"{i + 1}: {before[i]}" for start, stop, _, _ in spans for i in range(start, stop)]
+            added = [f"{i + 1}: {after[i]}" for _, _, start, stop in spans for i in range(start, stop)]
+            return "\n".join(removed), "\n".join(added)
+    return _shown(was), _shown(now)
 
 
 def _flattened(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

@@ -15,7 +15,6 @@ from orchestrator.api.native.routes import permitted_job
 from orchestrator.console.live import ServerSentEvent
 from orchestrator.console.routing import page_router
 from orchestrator.control.log_hub import LogHub
-from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import Operation
 from shared_store.volume.log_view import Chosen, LogView, Places
 from shared_store.volume.log_windows import LINES_A_WINDOW, Window, first_error, lines_after, lines_before, search
@@ -58,15 +57,12 @@ def window(
     around: str = Query(default="", max_length=50_000),
 ) -> dict[str, Any]:
     """A window of the log: its last lines, the lines before or after a place, or those around the line that ends at a place."""
-    try:
-        if after:
-            return _written(lines_after(chosen, positions_of(after)))
-        if around:
-            end = lines_after(chosen, positions_of(around), _AROUND).last
-            return _written(lines_before(chosen, end, LINES_A_WINDOW))
-        return _written(lines_before(chosen, positions_of(before) if before else chosen.end()))
-    except OSError as error:
-        raise _unreadable(error) from None
+    if after:
+        return _written(lines_after(chosen, positions_of(after)))
+    if around:
+        end = lines_after(chosen, positions_of(around), _AROUND).last
+        return _written(lines_before(chosen, end, LINES_A_WINDOW))
+    return _written(lines_before(chosen, positions_of(before) if before else chosen.end()))
 
 
 @router.get("/jobs/{reference}/log/search")
@@ -76,17 +72,10 @@ def find(
     place: str = Query(default="{}", max_length=50_000),
 ) -> dict[str, Any]:
     """Lines with a text, or the first errors where there is none; ``over`` is false where the search continues at ``place``."""
-    try:
-        start = positions_of(place)
-        found = search(chosen, text, start) if text else first_error(chosen, start)
-    except OSError as error:
-        raise _unreadable(error) from None
+    start = positions_of(place)
+    found = search(chosen, text, start) if text else first_error(chosen, start)
     ends = {"positions": [each.position for each in found.lines]}
     return {"lines": written(found.lines), **ends, "place": found.place, "over": found.is_over}
-
-
-def _unreadable(error: OSError) -> ClientError:
-    return ClientError(f"the log can't be read now: {error.strerror or error}", 503)
 
 
 def _written(found: Window) -> dict[str, Any]:
@@ -128,11 +117,10 @@ class LiveLog(AbstractContextManager["LiveLog"]):
             lag = sum(max(0, position - self.places.get(key, 0)) for key, position in end.items())
             if lag > _MOST_LAG:
                 last = lines_before(self.chosen, end)
-                begun = sum(max(0, last.first.get(key, 0) - self.places.get(key, 0)) for key in end)
+                skipped = sum(max(0, last.first.get(key, 0) - self.places.get(key, 0)) for key in end)
                 self._view, self.places = LogView(self.chosen, dict(end), PIECE), dict(end)
-                return ServerSentEvent("window", {**_written(last), "skipped": begun}), False
+                return ServerSentEvent("window", {**_written(last), "skipped": skipped}), False
             lines = self._view.poll()
         self.places = dict(self._view.offsets)
-        return ServerSentEvent(
-            "lines", {"lines": written(lines), "last": self.places}
-        ) if lines else None, self._view.behind
+        event = ServerSentEvent("lines", {"lines": written(lines), "last": self.places})
+        return event if lines else None, self._view.behind

@@ -56,47 +56,40 @@ class JobViewState:
 
 @dataclass
 class _View:
-    job: str
     command: list[str]
     state: JobViewState = field(default_factory=lambda: JobViewState(is_starting=True))
     seen: float = field(default_factory=time.monotonic)
-    process: subprocess.Popen[bytes] | None = None
-    is_wanted: bool = True
+    is_needed: bool = True
 
     def run(self) -> None:
         """Run the viewer until it ends; it dies with this thread, however the server ends."""
-        said: deque[str] = deque(maxlen=5)
-        self.process = process = start_tied(
+        lines: deque[str] = deque(maxlen=5)
+        process = start_tied(
             self.command,
             [signal.SIGHUP],  # the server's terminal is closed, and `nohup` keeps the server
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
         )
-        if not self.is_wanted:
-            process.terminate()
-        threading.Thread(target=self._watch, args=[process], name=f"view {self.job}", daemon=True).start()
+        threading.Thread(target=self._watch, args=[process], daemon=True).start()
         assert process.stdout is not None
         for raw in process.stdout:
             line = raw.decode(errors="replace").strip()
             if line.startswith(_AT):
                 self.state = JobViewState(url=line.removeprefix(_AT))
             elif line:
-                said.append(line)
+                lines.append(line)
         code = process.wait()
-        last = said[-1].removeprefix("muster: ") if said else f"exit code {code}"
-        self.state = JobViewState(problem=last[:500] if self.is_wanted and code else "")
+        last = lines[-1].removeprefix("muster: ") if lines else f"exit code {code}"
+        self.state = JobViewState(problem=last[:500] if self.is_needed and code else "")
 
     def _watch(self, process: subprocess.Popen[bytes]) -> None:
+        """End the viewer once it is not needed, or nobody has looked for long."""
         while process.poll() is None:
-            if time.monotonic() - self.seen > _UNSEEN:
-                self.end()
-            time.sleep(1.0)
-
-    def end(self) -> None:
-        self.is_wanted = False
-        if self.process is not None:
-            self.process.terminate()
+            self.is_needed = self.is_needed and time.monotonic() - self.seen <= _UNSEEN
+            if not self.is_needed:
+                process.terminate()
+            time.sleep(0.2)
 
 
 class Views:
@@ -108,8 +101,7 @@ class Views:
 
     def state(self, job: str, *, is_seen: bool = False) -> JobViewState:
         """The state of the job's view; ``is_seen``: a visitor has the job's page open."""
-        view = self._views.get(job)
-        if view is None:
+        if (view := self._views.get(job)) is None:
             return JobViewState()
         if is_seen:
             view.seen = time.monotonic()
@@ -124,13 +116,13 @@ class Views:
             if len(running) >= _MOST:
                 raise ClientError(f"{_MOST} live views are open on this server; close one first", CONFLICT)
             self._views = {name: self._views[name] for name in running}
-            view = self._views[job] = _View(job, command)
+            view = self._views[job] = _View(command)
         threading.Thread(target=view.run, name=f"viewer {job}", daemon=True).start()
 
     def end(self, job: str) -> None:
         """Close the job's view, where it has one."""
         if (view := self._views.get(job)) is not None:
-            view.end()
+            view.is_needed = False
 
 
 views = Views()
@@ -143,22 +135,14 @@ def show(request: Request, reference: str) -> Response:
     if not is_near(request):
         raise ClientError("the live view is reached from the server's machine alone; open the console there", CONFLICT)
     if detail["kind"] != "train" or detail["status"] != "RUNNING":
-        raise ClientError(f"job {detail['name']} is no training that runs; its checkpoints can be recorded", CONFLICT)
+        raise ClientError(f"job {detail['name']} is not a running training; its checkpoints can be recorded", CONFLICT)
     if find_spec("newton") is None:
         raise ClientError("the live view needs the simulation on this machine: pip install 'muster[worker]'", CONFLICT)
     run = permitted_run(controller_of(request), actor_of(request), detail["run"], Operation.READ_RUN)
-    command = [
-        sys.executable,
-        "-P",
-        "-m",
-        "worker.telemetry.live_view",
-        "--training",
-        str(run.path),
-        "--job",
-        detail["id"],
-    ]
-    views.start(detail["id"], [*command, "--port", "0", "--framed-by", _origin(request)])
-    return done(request, f"/jobs/{detail['id']}", "the live view starts")
+    module = [sys.executable, "-P", "-m", "worker.telemetry.live_view"]
+    options = {"training": str(run.path), "job": detail["id"], "port": "0", "framed-by": _origin(request)}
+    views.start(detail["id"], [*module, *(each for name, value in options.items() for each in (f"--{name}", value))])
+    return done(request, f"/jobs/{detail['id']}", "the live view is starting")
 
 
 @router.post("/jobs/{reference}/view/close")

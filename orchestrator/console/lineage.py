@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,16 +13,20 @@ _BOX = (190, 44)
 _GAP = (60, 16)
 
 
-@dataclass(frozen=True)
+@dataclass
 class Vertex:
     """A run or a version in the drawing; x and y of its upper left corner [px]."""
 
     title: str
     about: str
     link: str
-    x: int
-    y: int
+    parents: dict[str, str] = field(default_factory=dict)
+    """By key of the parent: the checkpoint."""
     is_chosen: bool = False
+    level: int = 0
+    """Length of the longest way from a run without a parent."""
+    x: int = 0
+    y: int = 0
 
     @property
     def shown(self) -> str:
@@ -50,17 +55,6 @@ class LineageGraph:
     height: int
 
 
-@dataclass
-class _Node:
-    title: str
-    about: str = ""
-    link: str = ""
-    level: int = 0
-    is_chosen: bool = False
-    parents: dict[str, str] = field(default_factory=dict)
-    """By key of the parent: the checkpoint."""
-
-
 Parent = Callable[[str], Mapping[str, Any] | None]
 """``parent`` of a run (``run``, ``iteration``); None where it has none, is gone or may not be seen."""
 
@@ -73,26 +67,22 @@ def drawing(versions: Sequence[Mapping[str, Any]], chosen: int, parent_of: Paren
         chosen: The version that the page shows.
         parent_of: Looks up the parent of a run.
     """
-    nodes: dict[str, _Node] = {}
+    nodes: dict[str, Vertex] = {}
     for each in versions:
-        name, run = f"{each['name']}@{each['version']}", str(each.get("run"))
-        score = each.get("score")
-        about = "" if not isinstance(score, int | float) else f"score {score:.2f}"
-        place = f"/models/{each['name']}?version={each['version']}"
-        iteration = str(each.get("iteration", "?"))
-        nodes[f"model {each['version']}"] = _Node(
-            name, about, place, is_chosen=each["version"] == chosen, parents={f"run {run}": iteration}
-        )
+        number, run, score = each["version"], str(each.get("run")), each.get("score")
+        about = f"score {score:.2f}" if isinstance(score, int | float) else ""
+        link, parents = f"/models/{each['name']}?version={number}", {f"run {run}": str(each.get("iteration", "?"))}
+        nodes[f"model {number}"] = Vertex(f"{each['name']}@{number}", about, link, parents, number == chosen)
         _add_run(nodes, run, each.get("parent"), parent_of)
     for key in nodes:
-        _level(nodes, key, ())
+        _find_level(nodes, key, ())
     return _placed(nodes)
 
 
-def _add_run(nodes: dict[str, _Node], run: str, parent: Any, parent_of: Parent) -> None:
+def _add_run(nodes: dict[str, Vertex], run: str, parent: Any, parent_of: Parent) -> None:
     """Add a run and all its ancestors; a model keeps its run's parent even where the run is gone."""
     while f"run {run}" not in nodes and len(nodes) < _MOST:
-        node = nodes[f"run {run}"] = _Node(run, "run", f"/runs/{run}")
+        node = nodes[f"run {run}"] = Vertex(run, "run", f"/runs/{run}")
         parent = parent if isinstance(parent, Mapping) else parent_of(run)
         if not parent or not parent.get("run"):
             return
@@ -101,29 +91,24 @@ def _add_run(nodes: dict[str, _Node], run: str, parent: Any, parent_of: Parent) 
         parent = None
 
 
-def _level(nodes: Mapping[str, _Node], key: str, above: tuple[str, ...]) -> int:
-    """The longest way from a run without a parent; a run that is its own ancestor, in a damaged store, counts once."""
-    node = nodes[key]
-    before = [
-        _level(nodes, each, (*above, key)) for each in node.parents if each in nodes and each not in (*above, key)
-    ]
+def _find_level(nodes: Mapping[str, Vertex], key: str, above: tuple[str, ...]) -> int:
+    """Set the level of a node; a run that is its own ancestor, in a damaged store, counts once."""
+    node, above = nodes[key], (*above, key)
+    before = [_find_level(nodes, each, above) for each in node.parents if each in nodes and each not in above]
     node.level = max(before, default=-1) + 1
     return node.level
 
 
-def _placed(nodes: Mapping[str, _Node]) -> LineageGraph:
-    rows: dict[int, int] = {}
-    boxes: dict[str, Vertex] = {}
-    for key, node in nodes.items():
-        row = rows[node.level] = rows.get(node.level, -1) + 1
-        x, y = node.level * (_BOX[0] + _GAP[0]), row * (_BOX[1] + _GAP[1])
-        boxes[key] = Vertex(node.title, node.about, node.link, x, y, node.is_chosen)
+def _placed(nodes: Mapping[str, Vertex]) -> LineageGraph:
+    rows = Counter[int]()
+    for box in nodes.values():
+        box.x, box.y = box.level * (_BOX[0] + _GAP[0]), rows[box.level] * (_BOX[1] + _GAP[1])
+        rows[box.level] += 1
     lines = [
-        Edge(boxes[parent].x + _BOX[0], boxes[parent].y + 22, boxes[key].x, boxes[key].y + 22, f"@{checkpoint}")
-        for key, node in nodes.items()
-        for parent, checkpoint in node.parents.items()
-        if parent in boxes
+        Edge(nodes[parent].x + _BOX[0], nodes[parent].y + 22, box.x, box.y + 22, f"@{checkpoint}")
+        for box in nodes.values()
+        for parent, checkpoint in box.parents.items()
+        if parent in nodes
     ]
-    width = max((box.x for box in boxes.values()), default=0) + _BOX[0]
-    height = max((box.y for box in boxes.values()), default=0) + _BOX[1]
-    return LineageGraph(list(boxes.values()), lines, width + 2, height + 2)
+    width, height = (max((getattr(box, axis) for box in nodes.values()), default=0) for axis in "xy")
+    return LineageGraph(list(nodes.values()), lines, width + _BOX[0] + 2, height + _BOX[1] + 2)

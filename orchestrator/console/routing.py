@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Coroutine
 from typing import Any
 
@@ -30,20 +29,18 @@ class PageRoute(APIRoute):
         async def answer(request: Request) -> Response:
             try:
                 return await handler(request)
-            except Unconfirmed as asked:
-                return asked.answer(request)
-            except ClientError as error:
-                return failure(request, str(error), error.status, kind_of(error))
+            except Unconfirmed as question:
+                return question.answer(request)
             except RequestValidationError as error:
                 first = error.errors()[0]
                 name = ".".join(map(str, first["loc"][1:])) or str(first["loc"][0])
                 return failure(request, f"{name}: {explain(first)}", 400)
-            except Unavailable as error:
-                return failure(request, str(error), 503, "ServerException")
-            except PluginError as error:
-                return failure(request, str(error), 500, "ServerException")
+            except ClientError as error:
+                return failure(request, str(error), error.status, kind_of(error))
             except DamagedFile as error:
                 return failure(request, f"the store holds a damaged file: {error}", 409)
+            except (Unavailable, PluginError) as error:
+                return failure(request, str(error), 503 if isinstance(error, Unavailable) else 500, "ServerException")
 
         return answer
 
@@ -61,9 +58,8 @@ def page_router(*repeatable: str, stored: bool = False) -> APIRouter:
     """
 
     def check_query(request: Request) -> None:
-        given = Counter(name for name, _ in request.query_params.multi_items() if name not in repeatable)
-        for name, times in given.items():
-            if times > 1:
+        for name in request.query_params:
+            if (times := len(request.query_params.getlist(name))) > 1 and name not in repeatable:
                 raise ClientError(f"the address has {name[:50]} {times} times; give it once")
 
     checks = [Depends(check_form), Depends(check_query)]

@@ -57,12 +57,10 @@ def files_of(run: Run) -> list[File]:
 
 
 def _in(run: Run, place: str) -> list[File]:
-    found = [
-        (path, facts) for path in _walk(run.path / place, 1) if (facts := path.stat(follow_symlinks=False)).st_size
-    ]
+    found = [(path, path.stat(follow_symlinks=False)) for path in _walk(run.path / place, 1)]
     found.sort(key=lambda each: each[1].st_mtime, reverse=True)
     files = []
-    for path, facts in found[:_MOST]:
+    for path, facts in [each for each in found if each[1].st_size][:_MOST]:
         name = path.relative_to(run.path).as_posix()
         files.append(File(name, facts.st_size, int(facts.st_mtime * 1000), f"/runs/{run.name}/files/{quote(name)}"))
     return files
@@ -70,11 +68,11 @@ def _in(run: Run, place: str) -> list[File]:
 
 def _walk(directory: Path, depth: int) -> Iterator[Path]:
     try:
-        with os.scandir(directory) as there:
-            entries = sorted(islice(there, _MOST_READ), key=lambda each: each.name)
+        with os.scandir(directory) as entries:
+            found = sorted(islice(entries, _MOST_READ), key=lambda each: each.name)
     except (FileNotFoundError, NotADirectoryError):
         return
-    for entry in entries:
+    for entry in found:
         if not NAME.fullmatch(entry.name):
             continue  # hidden, or of no use as an address
         if entry.is_file(follow_symlinks=False):

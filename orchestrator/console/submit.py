@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import Any
 
@@ -14,7 +15,7 @@ from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native import plan_routes, routes
 from orchestrator.api.native.plan_routes import PlanRequest
 from orchestrator.api.turns import Turns
-from orchestrator.console.forms import TOKEN, Form, done, sent_form
+from orchestrator.console.forms import Form, done, sent_form
 from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.submit_fields import FieldGroup, document, filled, form_of, forms, groups, tasks, written
@@ -53,8 +54,7 @@ _checks = Turns("other jobs are being checked")
 @router.get("/submit")
 def choose(request: Request) -> Response:
     """The page on which the task is chosen."""
-    actor = actor_of(request)
-    actor.check(Operation.SUBMIT_JOB)
+    _check_permission(request)
     kinds: dict[str, dict[str, str]] = {title: {} for title in (*(form.title for form in forms()), "Train a task")}
     for name, about in tasks().items():
         form = form_of(name)
@@ -95,15 +95,14 @@ def plain_again(request: Request, form: Form = Depends(sent_form)) -> Response:
 @router.post("/submit/check")
 def check(request: Request, form: Form = Depends(sent_form)) -> Response:
     """The YAML of the filled fields, its problem, and help for a line; ``whole`` also tries the texts of files."""
-    actor = actor_of(request)
-    actor.check(Operation.SUBMIT_JOB)
+    _check_permission(request)
     text, _ = _text(request, form)
     spec, problem = _checked(request, text, form.one("whole") == "yes")
     line = form.one("line")
     return JSONResponse(
         {
             "yaml": text,
-            "problem": problem and problem.document(),
+            "problem": problem and asdict(problem),
             "notes": list(spec.notes) if spec else [],
             "help": help_at(text, int(line)) if line.isascii() and line.isdigit() and len(line) < 7 else None,
         }
@@ -113,8 +112,7 @@ def check(request: Request, form: Form = Depends(sent_form)) -> Response:
 @_stored.post("/submit/review")
 def review(request: Request, form: Form = Depends(sent_form)) -> Response:
     """The YAML with the hosts on which its nodes would start; or the form again, with its problem."""
-    actor = actor_of(request)
-    actor.check(Operation.SUBMIT_JOB)
+    _check_permission(request)
     text, task = _text(request, form)
     spec, problem = _checked(request, text, whole=True)
     plan: dict[str, Any] = {}
@@ -130,31 +128,21 @@ def review(request: Request, form: Form = Depends(sent_form)) -> Response:
         if task:
             return _wizard(request, task, filled(form, _groups(request, task)), problem, 400)
         return _editor(request, text, problem, 400)
-    fields = [(name, value) for name, values in form.fields.items() for value in values if name != TOKEN]
-    return render(
-        request,
-        "submit_review.html",
-        spec=spec,
-        text=text,
-        plan=plan,
-        unplanned=unplanned,
-        task=task,
-        fields=fields,
-        once=secrets.token_urlsafe(16),
-    )
+    once, fields = secrets.token_urlsafe(16), form.repeated()
+    shown: dict[str, Any] = {"spec": spec, "text": text, "plan": plan, "unplanned": unplanned}
+    return render(request, "submit_review.html", **shown, task=task, fields=fields, once=once)
 
 
 @_stored.post("/submit")
 def submit(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Submit the job of a YAML, as ``muster submit`` does; a form that is sent again leads to the job that it made."""
-    actor = actor_of(request)
-    actor.check(Operation.SUBMIT_JOB)
-    text = _lines(form.one("yaml"))
-    spec, problem = _checked(request, text, whole=True)
+    _check_permission(request)
+    spec, problem = _checked(request, _lines(form.one("yaml")), whole=True)
     if spec is None:
         assert problem is not None
         raise ClientError(f"{SOURCE}{f':{problem.line}' if problem.line else ''}: {problem.message}")
-    job, is_new = submit_spec(controller_of(request), actor, spec, "", idempotency_key=form.one("once") or None)
+    controller, actor = controller_of(request), actor_of(request)
+    job, is_new = submit_spec(controller, actor, spec, "", idempotency_key=form.one("once") or None)
     beginning = "submitted" if is_new else "this form has already submitted"
     return done(request, f"/jobs/{job.id}", f"{beginning} {job.name} as {job.id[:8]}")
 
@@ -180,11 +168,10 @@ def _checked(request: Request, text: str, whole: bool) -> tuple[Spec | None, Sub
     A learner's code runs here only for keys with all queues, though it is in a sandbox: for other keys its text is checked here, and
     the job's ranks try it.
     """
-    actor = actor_of(request)
-    tries = whole and actor.queues is None
+    tries = whole and actor_of(request).queues is None
+    store = str(controller_of(request).access.store.path)
     try:
         with (_turns if tries else _checks).turn():
-            store = str(controller_of(request).access.store.path)
             return from_text(text, SOURCE, whole=tries, store=lambda: store), None
     except SpecError as error:
         return None, problem_of(str(error), text)
@@ -207,22 +194,24 @@ def _lines(text: str) -> str:
 
 
 def _groups(request: Request, task: str) -> list[FieldGroup]:
-    actor = actor_of(request)
-    actor.check(Operation.SUBMIT_JOB)
+    _check_permission(request)
     if task not in tasks():
         raise ClientError(unknown_task(task, tasks()), 404)
     with controller_of(request).database.session() as session:
-        return groups(task, queue_names(session, actor))
+        return groups(task, queue_names(session, actor_of(request)))
+
+
+def _check_permission(request: Request) -> None:
+    actor_of(request).check(Operation.SUBMIT_JOB)
 
 
 def _wizard(
     request: Request, task: str, found: Sequence[FieldGroup], problem: SubmissionProblem | None, status: int = 200
 ) -> Response:
-    actor = actor_of(request)
-    text = written(document(task, found))
     form = form_of(task)
-    there, missing = form.names(request) if form else ([], "")
-    names = [each.name for group in found for each in group.fields]
+    names, missing = form.names(request) if form else ([], "")
+    fields = [each.name for group in found for each in group.fields]
+    wrong = [name for name in fields if problem and f"{problem.key}.".startswith(f"{name}.")]
     return render(
         request,
         "submit_task.html",
@@ -230,23 +219,17 @@ def _wizard(
         task=task,
         about=tasks()[task],
         groups=found,
-        text=text,
-        names=there,
+        text=written(document(task, found)),
+        names=names,
         missing=missing,
         problem=problem,
-        wrong_name=_nearest_field(problem.key, names) if problem else "",
-        tries=actor.queues is None,
+        wrong_name=max(wrong, key=len, default=""),
+        tries=actor_of(request).queues is None,
     )
 
 
-def _nearest_field(key: str, names: Sequence[str]) -> str:
-    """The field that holds a key of the YAML; empty where none does."""
-    return max((name for name in names if f"{key}.".startswith(f"{name}.")), key=len, default="")
-
-
 def _editor(request: Request, text: str, problem: SubmissionProblem | None, status: int = 200) -> Response:
-    actor = actor_of(request)
-    actor.check(Operation.SUBMIT_JOB)
+    _check_permission(request)
     return render(request, "submit_yaml.html", status, text=text, problem=problem, help=help_at(text, 1))
 
 

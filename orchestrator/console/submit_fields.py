@@ -39,16 +39,14 @@ class Field:
 
     name: str
     """The key path in the YAML."""
-    kind: Literal["text", "value", "choice", "code", "names"] = "value"
-    """``text``: as it stands; ``value``: read as YAML; ``choice``: one of the options; ``code``: a text of several lines; ``names``: names,
-    one a line."""
+    kind: Literal["text", "value", "code", "names"] = "value"
+    """``text``: as it stands; ``value``: read as YAML; ``code``: a text of several lines; ``names``: names, one a line."""
     options: tuple[str, ...] = ()
+    """From which one is chosen; empty for any value."""
     value: str = ""
     placeholder: str = ""
     hint: str = ""
     required: bool = False
-    is_text: bool = False
-    """Whether an option is a text, and not a value of YAML."""
     file: str = ""
     """The name of the file whose text a ``code`` is; empty where it is a value of YAML."""
     picture: str = ""
@@ -128,32 +126,26 @@ def config_schema(task: str) -> Mapping[str, Any] | None:
 
 @cache
 def tasks() -> Mapping[str, str]:
-    """The installed tasks, and a sentence about each."""
-    about = {name: (config_schema(name) or {}).get("description", "") for name in known_tasks()}
-    return {name: _sentence(text) for name, text in about.items()}
-
-
-def _sentence(text: str) -> str:
-    """The first line of a docstring, without its markup."""
-    line = re.sub(r":\w+:|`|(?<=\w)Config\b", "", text.partition("\n")[0])
-    return line.partition(" Rewards: see")[0]
+    """The installed tasks, and a sentence about each: the first line of its docstring, without its markup."""
+    about = {name: (config_schema(name) or {}).get("description", "").partition("\n")[0] for name in known_tasks()}
+    return {
+        name: re.sub(r":\w+:|`|(?<=\w)Config\b", "", text).partition(" Rewards: see")[0] for name, text in about.items()
+    }
 
 
 def groups(task: str, queues: Sequence[str]) -> list[FieldGroup]:
     """The wizard's fields for a task. ``queues``: those to which the caller may submit."""
     form = form_of(task)
-    named = {"name": re.sub(r"[^A-Za-z0-9_-]", "-", task).strip("-").lower(), **_FIRST}
-    own = {"queue": tuple(queues), "train.algorithm": tuple(ALGORITHMS)}
-    chosen = {"queue": "default" if "default" in queues else next(iter(queues), ""), "train.algorithm": "ppo"}
+    first = {"name": re.sub(r"[^A-Za-z0-9_-]", "-", task).strip("-").lower(), **_FIRST, "train.algorithm": "ppo"}
+    first["queue"] = "default" if "default" in queues else next(iter(queues), "")
+    options = {"queue": tuple(queues), "train.algorithm": tuple(ALGORITHMS)}
 
     def job(*names: str) -> tuple[Field, ...]:
-        found = [_field(name, _at(name)) for name in names]
-        return tuple(
-            replace(each, kind="choice", options=own[each.name], is_text=True, value=chosen[each.name], required=True)
-            if each.name in own
-            else replace(each, value=named.get(each.name, ""), required=each.name in named)
-            for each in found
-        )
+        fields = [_field(name, _at(name)) for name in names]
+        fields = [
+            replace(each, kind="text", options=options[each.name]) if each.name in options else each for each in fields
+        ]
+        return tuple(replace(each, value=first.get(each.name, ""), required=each.name in first) for each in fields)
 
     found = [FieldGroup("Job", job(*_JOB), True), FieldGroup("Training", job(*_TRAINING), True)]
     found += form.groups(task) if form else []
@@ -162,12 +154,12 @@ def groups(task: str, queues: Sequence[str]) -> list[FieldGroup]:
         hint = "This task publishes no schema; its ranks check the settings."
         found.append(FieldGroup("Configuration of the task", (Field("train.config", hint="YAML"),), hint=hint))
     else:
-        left_out = {*kept_files(task_config(task)), *(form.keys if form else ())}
-        found += _groups("Task", config["properties"], "train.config", left_out)
+        without = {*kept_files(task_config(task)), *(form.keys if form else ())}
+        found += _groups("Task", {k: v for k, v in config["properties"].items() if k not in without}, "train.config")
     for name in ALGORITHMS:
         section = job_schema()["$defs"][f"Settings_{name}"]
         hint = "Empty fields keep the task's own values."
-        found += _groups(f"Algorithm {name}", section["properties"], f"train.{name}", (), name, hint)
+        found += _groups(f"Algorithm {name}", section["properties"], f"train.{name}", name, hint)
     return [*found, FieldGroup("More", job(*_MORE))]
 
 
@@ -180,76 +172,60 @@ def _at(path: str) -> Mapping[str, Any]:
 
 
 def _groups(
-    title: str, properties: Mapping[str, Any], prefix: str, without: Any, algorithm: str = "", hint: str = ""
+    title: str, properties: Mapping[str, Any], prefix: str, algorithm: str = "", hint: str = ""
 ) -> Iterator[FieldGroup]:
     """A group of the plain fields of a section, then one for each section in it."""
-    own: list[Field] = []
-    inner: list[FieldGroup] = []
-    for key, about in properties.items():
-        if key in without:
-            continue
-        if sections := plain(about).get("properties"):
-            inner += _groups(f"{title}: {key}", sections, f"{prefix}.{key}", (), algorithm)
-        else:
-            own.append(_field(f"{prefix}.{key}", about))
-    if own:
-        yield FieldGroup(title, tuple(own), algorithm=algorithm, hint=hint)
-    yield from inner
+    inner = {key: nested for key, about in properties.items() if (nested := plain(about).get("properties"))}
+    if fields := tuple(_field(f"{prefix}.{key}", about) for key, about in properties.items() if key not in inner):
+        yield FieldGroup(title, fields, algorithm=algorithm, hint=hint)
+    for key, nested in inner.items():
+        yield from _groups(f"{title}: {key}", nested, f"{prefix}.{key}", algorithm)
 
 
 def _field(name: str, about: Mapping[str, Any]) -> Field:
     about = plain(about)
-    default = about.get("default")
-    placeholder = "" if default is None else default if isinstance(default, str) else json.dumps(default)
-    hint = "; ".join(filter(None, (about.get("description", ""), bounds(about))))
-    if about.get("type") == "boolean" or "enum" in about:
-        values = about.get("enum", [True, False])
-        options = tuple(each if isinstance(each, str) else json.dumps(each) for each in values)
-        is_text = all(isinstance(each, str) for each in values)
-        return Field(name, "choice", options, "", placeholder, hint, is_text=is_text)
-    kind: Literal["text", "value"] = "text" if about.get("type") == "string" else "value"
-    return Field(name, kind, (), "", placeholder, hint)
+    default, values = about.get("default"), about.get("enum", [True, False] if about.get("type") == "boolean" else [])
+    is_text = about.get("type") == "string" or (values and all(isinstance(each, str) for each in values))
+    return Field(
+        name,
+        "text" if is_text else "value",
+        tuple(each if isinstance(each, str) else json.dumps(each) for each in values),
+        placeholder="" if default is None else default if isinstance(default, str) else json.dumps(default),
+        hint="; ".join(filter(None, (about.get("description", ""), bounds(about)))),
+    )
+
+
+_KINDS = {"integer": "integer", "number": "number", "array": "list, such as [1, 2]", "object": "mapping"}
+_LIMITS = {"minimum": "from", "exclusiveMinimum": "above", "maximum": "up to", "exclusiveMaximum": "below"}
 
 
 def bounds(about: Mapping[str, Any]) -> str:
     """The type of a value and its limits, in words."""
-    words = {"integer": "whole number", "number": "number", "array": "list, such as [1, 2]", "object": "mapping"}
-    limits = {
-        "minimum": "from {}",
-        "exclusiveMinimum": "above {}",
-        "maximum": "up to {}",
-        "exclusiveMaximum": "below {}",
-    }
-    told = [text.format(str(about[key])) for key, text in limits.items() if key in about]
-    return " ".join(filter(None, (words.get(str(about.get("type")), ""), *told)))
+    limits = [f"{words} {about[key]}" for key, words in _LIMITS.items() if key in about]
+    return " ".join(filter(None, (_KINDS.get(str(about.get("type")), ""), *limits)))
 
 
 def filled(form: Form, found: Sequence[FieldGroup]) -> list[FieldGroup]:
     """The groups with the values of a form that was sent."""
-    return [
-        replace(
-            group,
-            fields=tuple(
-                replace(each, value="\n".join(form.every(each.name)) if each.kind == "names" else _given(form, each))
-                for each in group.fields
-            ),
-        )
-        for group in found
-    ]
 
+    def value(field: Field) -> str:
+        return "\n".join(form.every(field.name)[0 if field.kind == "names" else -1 :]).replace("\r\n", "\n")
 
-def _given(form: Form, field: Field) -> str:
-    return form.one(field.name).replace("\r\n", "\n")
+    return [replace(group, fields=tuple(replace(each, value=value(each)) for each in group.fields)) for group in found]
 
 
 def document(task: str, found: Sequence[FieldGroup]) -> dict[str, Any]:
     """The job described by filled groups."""
     result: dict[str, Any] = {}
-    algorithm = next((each.value for group in found for each in group.fields if each.name == "train.algorithm"), "")
+    fields = {each.name: each for group in found for each in group.fields}
+    algorithm = fields["train.algorithm"].value
     for group in found:
         for field in group.fields:
             if field.value.strip() and group.algorithm in ("", algorithm):
-                _put(result, field.name.split("."), _value(field))
+                target, (*path, key) = result, field.name.split(".")
+                for part in path:
+                    target = target.setdefault(part, {})
+                target[key] = _value(field)
     train = result.pop("train", {})
     more = {key: result.pop(key) for key in list(result) if key not in ("name", "queue", "nodes", "resources")}
     return {**result, "train": {"task": task, **train}, **more}
@@ -262,7 +238,7 @@ def _value(field: Field) -> Any:
         return names[0] if len(names) == 1 else names
     if field.file:
         return {"file": field.file, "text": text if text.endswith("\n") else text + "\n"}
-    if field.kind == "text" or field.is_text:
+    if field.kind == "text":
         return text.strip()
     if _NUMBER.fullmatch(text.strip()):
         return float(text)
@@ -272,27 +248,19 @@ def _value(field: Field) -> Any:
         return text.strip()  # the spec's own check says what was expected
 
 
-def _put(target: dict[str, Any], path: Sequence[str], value: Any) -> None:
-    for key in path[:-1]:
-        target = target.setdefault(key, {})
-    target[path[-1]] = value
-
-
 class _Dumper(yaml.SafeDumper):
     """Texts of several lines as they are, and short lists on one line."""
 
 
-def _text(dumper: yaml.SafeDumper, value: str) -> yaml.Node:
-    return dumper.represent_scalar("tag:yaml.org,2002:str", value, "|" if "\n" in value else None)
-
-
-def _list(dumper: yaml.SafeDumper, value: list[Any]) -> yaml.Node:
-    is_flat = not any(isinstance(each, dict) for each in value)
-    return dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=is_flat)
-
-
-_Dumper.add_representer(str, _text)
-_Dumper.add_representer(list, _list)
+_Dumper.add_representer(
+    str, lambda dumper, text: dumper.represent_scalar("tag:yaml.org,2002:str", text, "|" if "\n" in text else None)
+)
+_Dumper.add_representer(
+    list,
+    lambda dumper, values: dumper.represent_sequence(
+        "tag:yaml.org,2002:seq", values, flow_style=not any(isinstance(each, dict) for each in values)
+    ),
+)
 
 
 def written(job: Mapping[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from orchestrator.console.submit_fields import bounds, config_schema, job_schema, plain
@@ -26,9 +26,6 @@ class SubmissionProblem:
     """In the YAML, from 1; 0 where it is not known."""
     code_line: int = 0
     """In the code of a file that the YAML holds."""
-
-    def document(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def problem_of(error: str, text: str) -> SubmissionProblem:
@@ -64,12 +61,12 @@ def help_at(text: str, line: int) -> dict[str, Any]:
     document, path = _place(text, line)
     about = _about(path, document)
     section = next(path[:end] for end in range(len(path), -1, -1) if _keys(_about(path[:end], document)))
-    given = _value(document, section)
+    written = _value(document, section)
     keys = [
-        {"name": name, "about": told(each), "given": isinstance(given, Mapping) and name in given}
+        {"name": name, "about": in_one_line(each), "given": isinstance(written, Mapping) and name in written}
         for name, each in _keys(_about(section, document)).items()
     ]
-    key = {"name": ".".join(map(str, path)), "about": told(about), "given": True} if path and about else None
+    key = {"name": ".".join(map(str, path)), "about": in_one_line(about), "given": True} if path and about else None
     return {"section": ".".join(map(str, section)), "key": key, "keys": keys}
 
 
@@ -121,7 +118,7 @@ def _value(document: Any, path: tuple[str | int, ...]) -> Any:
     return document
 
 
-def told(about: Mapping[str, Any] | None) -> str:
+def in_one_line(about: Mapping[str, Any] | None) -> str:
     """A part of the schema in one line."""
     about = plain(about or {})
     choice = ", ".join(map(str, about.get("enum") or about.get("examples") or ()))

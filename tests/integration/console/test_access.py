@@ -114,7 +114,7 @@ def test_a_change_needs_the_token_of_a_form_of_the_same_session(console: Console
     token = visitor.page("/").form_token
     for given in ("", "x", "ä", other.page("/").form_token):
         answer = visitor.http.post("/jobs/stop", data={"form_token": given, "job": "x", "confirmed": "yes"})
-        assert answer.status_code == 403 and "load the page again" in answer.text
+        assert answer.status_code == 403 and "reload the page" in answer.text
     answer = visitor.http.post("/jobs/stop", data={"form_token": token}, headers={"X-Form-Token": "x"})
     assert answer.status_code == 403
     answer = visitor.http.post("/jobs/stop", data={"form_token": token})

@@ -221,7 +221,7 @@ def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_said_yes(console
     await_status(console.client, first, "FAILED")
     visitor = console.visitor()
     asked = visitor.submit(f"/jobs/{first}/resume", checkpoint="3")
-    assert asked.status_code == 409 and "after iteration 3 counts no longer" in asked.json()["question"]["text"]
+    assert asked.status_code == 409 and "after iteration 3 no longer counts" in asked.json()["question"]["text"]
     sent = {"confirmed": "yes", "changes": "train.iterations=30\n\n", "accept_changed_robot": "yes"}
     answer = visitor.submit(f"/jobs/{first}/resume", checkpoint="3", **sent)
     resumed = spec_of(console, answer)["train"]
@@ -398,7 +398,7 @@ def test_what_can_t_be_watched_is_refused_in_one_line(console: Console) -> None:
     job = console.submit(console.register("waits"), "waits")
     answer = console.visitor().submit(f"/jobs/{job}/view")
     assert answer.status_code == 409
-    assert answer.json()["message"] == "job waits is no training that runs; its checkpoints can be recorded"
+    assert answer.json()["message"] == "job waits is not a running training; its checkpoints can be recorded"
     assert console.visitor("reader").submit(f"/jobs/{job}/view").status_code == 403
     far = console.visitor().http.post(f"/jobs/{job}/view", headers={"Host": "robots.example", "Accept": "*/*"})
     assert far.status_code == 403

@@ -164,4 +164,4 @@ def test_a_read_only_key_and_a_key_of_another_queue_submit_nothing(console: Cons
     assert "may use job queue lab only" in lab.refusal("/submit", yaml=COMMAND.replace("queue: lab", "queue: default"))
     token = lab.page("/").form_token
     stolen = lab.http.post("/submit", data={"form_token": token[:-1] + "x", "yaml": COMMAND})
-    assert stolen.status_code == 403 and "load the page again" in stolen.text
+    assert stolen.status_code == 403 and "reload the page" in stolen.text
