@@ -68,7 +68,7 @@ def compare(
         ],
         differences=[(sentence(each), each["verdict"]) for each in differences if each],
         first=first.label if first else "",
-        given=" ".join(runs),
+        patterns=" ".join(runs),
         metrics=metrics,
         metric=metric or "reward",
         curves=f"/compare/curves?{urlencode([('run', name) for name in names])}",
@@ -103,13 +103,13 @@ def _line(group: RunGroup, metric: str, at: Sequence[float]) -> dict[str, Any]:
 
 def _chosen(request: Request, patterns: Sequence[str]) -> list[str]:
     """The names that the patterns match, in the order of the patterns, which may be separated by spaces. Raises ClientError."""
-    given = [part for each in patterns for part in each.split()]
-    _check_number(len(given), "runs or patterns")
-    is_pattern = {each: any(sign in each for sign in "*?[") for each in given}
+    parts = [part for each in patterns for part in each.split()]
+    _check_number(len(parts), "runs or patterns")
+    is_pattern = {each: any(sign in each for sign in "*?[") for each in parts}
     controller, actor = controller_of(request), actor_of(request)
     known = [run.name for run in visible_runs(controller, actor)] if any(is_pattern.values()) else []
     chosen: dict[str, None] = {}
-    for each in given:
+    for each in parts:
         matching = [name for name in known if fnmatchcase(name, each)] if is_pattern[each] else [each]
         if not matching:
             raise ClientError(f"no run matches {each[:128]}; the page of runs has their names", 404)

@@ -1,8 +1,7 @@
 """The curves of a run as pages draw them: a window of its metrics, thinned here, however long the history is.
 
 ``GET /runs/{name}/curves`` answers ``{"iterations": [...], "series": {name: [...]}, "last": n, "first": n}``: the series have a value
-(or null) for each of the iterations, which rise. ``from`` and ``to`` are a window of iterations, ``points`` the most of them that are
-wanted, and each ``name`` a metric, or a group of them with a ``*`` at its end (``reward_*``); all numbers where no name is given.
+(or null) for each of the iterations, which rise. ``from`` and ``to`` are a window of iterations, ``points`` the most of them, and each ``name`` a metric, or a group of them with a ``*`` at its end (``reward_*``); all numbers without a name.
 ``env_steps``, ``total_seconds`` and ``time`` are metrics too, and serve as the other axis.
 
 ``static/curves.js`` draws them: ``Chart`` a chart of any lines, ``RunCurves`` the charts of a run that its stream continues
@@ -35,7 +34,7 @@ POINTS = 300
 """Points of a curve by default; a chart is seldom wider than that many points two pixels apart."""
 _MOST_POINTS = 1000
 _MOST_READ = 4000
-"""Records that are read for an answer."""
+"""Records that are read for a response."""
 _RECORDS = 200
 """Iterations that one event brings; a page that has missed more reads its curves again."""
 LABELS = {each.name: each.label for each in LEARNING}
@@ -61,14 +60,14 @@ def run_curves(
 def curves_of(
     run: Run, names: Sequence[str] = (), begin: int = 0, end: int | None = None, points: int = POINTS
 ) -> dict[str, Any]:
-    """The answer of the route; reads at most 4000 records. Raises OSError.
+    """The response of the route; reads at most 4000 records. Raises OSError.
 
     Args:
         run: The run.
         names: Metrics, or groups ending on ``*``; all where empty.
         begin: First iteration.
         end: Last iteration; the newest where None.
-        points: Iterations that are answered at most; the first and the last of the window are among them.
+        points: At most so many iterations; the first and the last of the window are among them.
     """
     last = max((each["iteration"] for each in sampled(run, 2)), default=0)
     until = last if end is None else min(end, last)
@@ -135,10 +134,10 @@ def position(iteration: int | None, log: Mapping[str, int]) -> str:
     return json.dumps({"i": iteration, "l": log}, separators=(",", ":"))
 
 
-def read_position(given: str) -> tuple[int | None, dict[str, int] | None]:
+def read_position(text: str) -> tuple[int | None, dict[str, int] | None]:
     """Iteration and log of :func:`position`; None for each if it can't be read."""
     try:
-        read = json.loads(given)
+        read = json.loads(text)
         iteration, log = read["i"], read["l"]
         fits = all(isinstance(each, int) and 0 <= each < 2**63 for each in log.values())
         if fits and (iteration is None or isinstance(iteration, int)):

@@ -64,9 +64,9 @@ def link(address: str, text: str) -> Markup:
     return Markup(f'<a href="{escape(address)}">{escape(text)}</a>')
 
 
-def count(given: Any) -> str:
+def count(number: Any) -> str:
     """A number in at most four digits: ``12``, ``3.46``, ``18.2 k``, ``1.07 M``; empty for a value other than a number."""
-    value = finite(given)
+    value = finite(number)
     if value is None:
         return ""
     for size, unit in ((1e9, " G"), (1e6, " M"), (1e4, " k")):

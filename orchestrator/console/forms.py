@@ -1,6 +1,6 @@
-"""Forms: their token, questions before something is lost, and the answer to a change.
+"""Forms: their token, questions before something is lost, and the response to a change.
 
-A form works without scripts (a page asks, a page answers); with ``static/forms.js`` the same addresses answer in JSON, and the question
+A form works without scripts (a page asks, a page responds); with ``static/forms.js`` the same addresses respond in JSON, and the question
 is a dialog on the page.
 """
 
@@ -63,7 +63,7 @@ class Form:
         return [(name, value) for name, values in self.fields.items() for value in values if name != TOKEN]
 
     def confirm(self, question: Question) -> None:
-        """Continue only where the person was asked and said yes. Raises Unconfirmed."""
+        """Continue only where the person was asked and confirmed. Raises Unconfirmed."""
         if self.one("confirmed") != "yes":
             raise Unconfirmed(question, self)
 
@@ -75,7 +75,7 @@ class Unconfirmed(Exception):
         super().__init__(question.title)
         self.question, self.form = question, form
 
-    def answer(self, request: Request) -> Response:
+    def response(self, request: Request) -> Response:
         """The question, as a page or for the dialog."""
         if not wants_page(request):
             return JSONResponse({"question": asdict(self.question)}, 409)
@@ -106,22 +106,22 @@ async def check_form(request: Request) -> None:
     """Refuse a change that does not come from a form of this console. Raises Refusal."""
     if request.method in ("GET", "HEAD") or request.url.path == _OPEN:
         return
-    token = request.headers.get("x-form-token") or (await sent_form(request)).one(TOKEN)
+    token = (await sent_form(request)).one(TOKEN)
     if not hmac.compare_digest(token.encode(), form_token(request).encode()):
         raise Refusal("AccessDeniedException", "the session has expired; reload the page")
 
 
-def body_of(kind: type[_Body], given: Mapping[str, Any]) -> _Body:
+def body_of(kind: type[_Body], fields: Mapping[str, Any]) -> _Body:
     """A request's body made of a form's texts. Raises ClientError that names the first wrong field."""
     try:
-        return kind.model_validate(given)
+        return kind.model_validate(fields)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         raise ClientError(f"{'.'.join(map(str, path_of(first)))}: {explain(first)}") from None
 
 
 def done(request: Request, path: str, message: str = "") -> Response:
-    """The answer to a change: the page at ``path``, and a message there."""
+    """The response to a change: the page at ``path``, and a message there."""
     if not wants_page(request):
         return JSONResponse({"location": path, "message": message})
     return RedirectResponse(path, 303)

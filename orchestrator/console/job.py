@@ -85,7 +85,7 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     definition = batch.call(controller, actor, "DescribeJobs", {"jobs": [chosen.job]})["jobs"][0]["jobDefinition"]
     is_over = False
 
-    def look() -> tuple[bool, bool, dict[str, Any]]:
+    def read() -> tuple[bool, bool, dict[str, Any]]:
         detail = job_detail(request, chosen.job)
         checkpoints = _checkpoints(controller, actor, detail)
         view = views.state(chosen.job, is_seen=True)
@@ -97,12 +97,12 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
         )
 
     def changes() -> Sequence[ServerSentEvent] | None:
-        """The events since the last look; None once the job is over and all its events have been sent."""
+        """The events since the last read; None once the job is over and all its events have been sent."""
         nonlocal is_over
         if is_over:
             return None
         # before the log: nothing is written after the end
-        has_ended, has_run, parts = _recent.get((id(controller), actor, chosen.job), look)
+        has_ended, has_run, parts = _recent.get((id(controller), actor, chosen.job), read)
         events = live.changes(parts) + (iterations.changes() if has_run else [])
         lines, is_behind = log.changes(is_last=has_ended)
         events += [lines] if lines else []

@@ -48,10 +48,10 @@ def stop(request: Request, reference: str, form: Form = Depends(sent_form)) -> R
 def save(request: Request, reference: str) -> Response:
     """Have a training save a checkpoint now."""
     job, _, _, _ = _job(request, reference, Operation.CHECKPOINT_JOB)
-    answer = routes.save_now(request, job)["answer"]
-    if not answer.startswith("checkpoint "):
-        raise ClientError(answer, CONFLICT)
-    return done(request, f"/jobs/{job}", answer)
+    message = routes.save_now(request, job)["answer"]
+    if not message.startswith("checkpoint "):
+        raise ClientError(message, CONFLICT)
+    return done(request, f"/jobs/{job}", message)
 
 
 @_stored.post("/jobs/{reference}/resume")
@@ -70,8 +70,8 @@ def resume(request: Request, reference: str, form: Form = Depends(sent_form)) ->
         form.confirm(Question(f"Continue from iteration {chosen.iteration}?", text, "Resume"))
     iteration = chosen.iteration if chosen and marked is not None else None
     changes = (*_changes(form), *(["train.accept_changed_robot=true"] if _accepts(form) else []))
-    answer = resume_job(controller_of(request), actor, run, Changes(iteration, changes, directory))
-    return done(request, f"/jobs/{answer['jobId']}", f"resumed {run.name} from iteration {answer['iteration']}")
+    resumed = resume_job(controller_of(request), actor, run, Changes(iteration, changes, directory))
+    return done(request, f"/jobs/{resumed['jobId']}", f"resumed {run.name} from iteration {resumed['iteration']}")
 
 
 @_stored.post("/jobs/{reference}/clone")
@@ -129,14 +129,14 @@ def _run(request: Request, reference: str, operation: Operation) -> tuple[Run, s
 
 def _checkpoint(form: Form) -> _Marked:
     """The marked checkpoint: an iteration, ``best``, or None for the newest. Raises ClientError."""
-    given = form.one("checkpoint")
-    if given in ("", "latest"):
+    marked = form.one("checkpoint")
+    if marked in ("", "latest"):
         return None
-    if given == "best":
+    if marked == "best":
         return "best"
-    if given.isascii() and given.isdecimal() and len(given) < 10:
-        return int(given)
-    raise ClientError(f"checkpoint {given[:50]!r}: expected an iteration, best or latest")
+    if marked.isascii() and marked.isdecimal() and len(marked) < 10:
+        return int(marked)
+    raise ClientError(f"checkpoint {marked[:50]!r}: expected an iteration, best or latest")
 
 
 def _accepts(form: Form) -> bool:

@@ -80,7 +80,7 @@ def before_it(
 
     That is the job before it in its run, else the run whose weights a clone began with.
     """
-    queues = actor.queues
+    queues, parent = actor.queues, ((detail["results"] or {}).get("parent") or {}).get("run")
     with controller.database.session() as session:
         query = select(Job).where(
             Job.run == detail["run"], Job.created_at < detail["createdAt"], Job.id != detail["id"]
@@ -94,16 +94,14 @@ def before_it(
             if spec:
                 spec = with_texts(controller, detail["run"], spec)
                 return f"the job before it, {earlier.name}", f"/jobs/{earlier.id}", actor.shown(spec)
-    parent = (detail["results"] or {}).get("parent") or {}
-    name = parent.get("run")
-    if not isinstance(name, str):
+    if not isinstance(parent, str):
         return None
     try:
-        run = facts_of(permitted_run(controller, actor, name, Operation.READ_RUN))
+        run = facts_of(permitted_run(controller, actor, parent, Operation.READ_RUN))
         with controller.database.session() as session:
-            spec = runs.spec_of(session, actor, run)
+            found = runs.spec_of(session, actor, run)
     except (ClientError, DamagedFile, OSError):
         return None  # deleted, or another's
-    if not spec:
+    if not found:
         return None
-    return f"its parent {name}", f"/runs/{name}", actor.shown(with_texts(controller, name, spec))
+    return f"its parent {parent}", f"/runs/{parent}", actor.shown(with_texts(controller, parent, found))

@@ -37,7 +37,7 @@ def chosen_log(
     rank: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
     attempt: Annotated[str, Query(max_length=10, pattern="^[0-9]*$")] = "",
 ) -> Chosen:
-    """The lines of the job that are asked for; empty numbers mean all. Raises ClientError."""
+    """The lines of the job that are requested; empty numbers mean all. Raises ClientError."""
     controller, actor = controller_of(request), actor_of(request)
     with controller.database.session() as session:
         job = permitted_job(session, actor, reference, Operation.READ_JOB_LOGS)
@@ -104,7 +104,7 @@ class LiveLog(AbstractContextManager["LiveLog"]):
         self._following.__exit__(*error)
 
     def wake(self) -> None:
-        """The page looks at intervals anyway."""
+        """The page polls at intervals anyway."""
 
     def changes(self, is_last: bool) -> tuple[ServerSentEvent | None, bool]:
         """The event ``lines`` or ``window``, and whether there is more already; ``is_last``: the job is over, so that the files have all.

@@ -133,7 +133,7 @@ def show(request: Request, reference: str) -> Response:
     """Start the live view of a training that runs on this machine."""
     detail = job_detail(request, reference)
     if not is_near(request):
-        raise ClientError("the live view is reached from the server's machine alone; open the console there", CONFLICT)
+        raise ClientError("the live view is available only on the server's machine; open the console there", CONFLICT)
     if detail["kind"] != "train" or detail["status"] != "RUNNING":
         raise ClientError(f"job {detail['name']} is not a running training; its checkpoints can be recorded", CONFLICT)
     if find_spec("newton") is None:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlencode
 
 from fastapi import Depends, Query, Request, Response
@@ -45,44 +45,45 @@ _recent = Recent()
 
 @dataclass(frozen=True)
 class _Choice:
-    """The filter and the page of the table, as an address gives them."""
+    """The filter and the place of the page, as an address gives them; empty for all, and for the first page."""
 
-    filter: Mapping[str, str]
-    """``state``, ``queue`` and ``search``; empty for all."""
-    jobs: Wanted
-    after: str
-    before: str
-    """The place of the page."""
+    state: Annotated[str, Query(max_length=20)] = ""
+    queue: Annotated[str, Query(max_length=128)] = ""
+    search: Annotated[str, Query(max_length=_LONGEST)] = ""
+    after: Annotated[str, Query(max_length=_LONGEST)] = ""
+    before: Annotated[str, Query(max_length=_LONGEST)] = ""
+
+    @property
+    def filter(self) -> dict[str, str]:
+        return {"state": self.state, "queue": self.queue, "search": self.search}
+
+    @property
+    def wanted(self) -> Wanted:
+        """Raises ClientError."""
+        return _wanted(**self.filter)
 
 
-def _choice(
-    state: str = Query(default="", max_length=20),
-    queue: str = Query(default="", max_length=128),
-    search: str = Query(default="", max_length=_LONGEST),
-    after: str = Query(default="", max_length=_LONGEST),
-    before: str = Query(default="", max_length=_LONGEST),
-) -> _Choice:
-    chosen = {"state": state, "queue": queue, "search": search}
-    return _Choice(chosen, _wanted(**chosen), after, before)
+_Chosen = Annotated[_Choice, Depends()]
 
 
 @router.get("/")
-def jobs(request: Request, choice: _Choice = Depends(_choice)) -> Response:
+def jobs(request: Request, choice: _Chosen) -> Response:
     """The table."""
     controller, actor = controller_of(request), actor_of(request)
     parts = _parts(controller, actor, choice)
     with controller.database.session() as session:
         queues = queue_names(session, actor)
-    query = urlencode({**choice.filter, "after": choice.after, "before": choice.before})
-    return render(request, "jobs.html", **parts, queues=queues, chosen=choice.filter, stream=f"/jobs/stream?{query}")
+    address = f"/jobs/stream?{urlencode(asdict(choice))}"
+    return render(request, "jobs.html", **parts, queues=queues, chosen=choice.filter, stream=address)
 
 
 @router.get("/jobs/stream")
-def jobs_stream(request: Request, choice: _Choice = Depends(_choice)) -> Response:
+def jobs_stream(request: Request, choice: _Chosen) -> Response:
     """The changes in a window of the table, as events."""
     live = LiveParts(request, "jobs_live.html", chosen=choice.filter)
-    look = partial(_parts, controller_of(request), actor_of(request), choice)
-    return stream(request, lambda: live.changes(look()))
+    _ = choice.wanted  # refused at once, if at all
+    read = partial(_parts, controller_of(request), actor_of(request), choice)
+    return stream(request, lambda: live.changes(read()))
 
 
 @router.post("/jobs/stop")
@@ -99,7 +100,7 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     if not ids:
         raise ClientError("no job that can be stopped is marked; mark some in the table first")
     several = counted(len(ids), "job")
-    text = "Trainings save a checkpoint before they leave, and can be resumed. Waiting jobs are cancelled."
+    text = "Trainings save a checkpoint before they end, and can be resumed. Waiting jobs are cancelled."
     form.confirm(Question(f"Stop {several}?", text, f"Stop {several}"))
     refused: list[ClientError] = []
     for start in range(0, len(ids), _AT_ONCE):
@@ -120,13 +121,12 @@ def _wanted(state: str, queue: str, search: str) -> Wanted:
 
 def _parts(controller: Controller, actor: Actor, choice: _Choice) -> dict[str, Any]:
     """The live parts of a page of the table; open pages of all who see the same queues share them."""
-    seen = None if actor.queues is None else tuple(sorted(actor.queues))
-    key = (id(controller), seen, choice.jobs, choice.after, choice.before)
-    return _recent.get(key, partial(_read_parts, controller, actor, choice))
+    visible = None if actor.queues is None else tuple(sorted(actor.queues))
+    return _recent.get((id(controller), visible, choice), partial(_read_parts, controller, actor, choice))
 
 
 def _read_parts(controller: Controller, actor: Actor, choice: _Choice) -> dict[str, Any]:
-    found = page_of_jobs(controller, actor, choice.jobs, ROWS, choice.after, choice.before)
+    found = page_of_jobs(controller, actor, choice.wanted, ROWS, choice.after, choice.before)
     counts, more, rows = found["counts"], "+" if found["areMore"] else "", found["jobs"]
     address = partial(_address, **choice.filter)
     return {

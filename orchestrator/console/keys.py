@@ -17,7 +17,7 @@ from orchestrator.services.context import queue_names
 
 router = page_router()
 _INTERVAL = 1.0
-"""Seconds between two looks at the keys."""
+"""Seconds between two polls of the keys."""
 
 
 @router.get("/keys")

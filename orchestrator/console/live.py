@@ -26,11 +26,11 @@ from orchestrator.domain.errors import ClientError, Unavailable
 from shared_store.volume.files import DamagedFile
 
 INTERVAL = 0.5
-"""Seconds between two looks."""
+"""Seconds between two polls."""
 _HEARTBEAT = 10.0
 """Seconds after which an idle stream sends a comment: that reveals a browser that has left."""
 _PATIENCE = 5.0
-"""Seconds for which a look may take until the page says so."""
+"""Seconds that a poll may take until the page says so."""
 _SILENT = f"the store or the database has not answered for {_PATIENCE:.0f} s; the page goes on when it does"
 _LONGEST = 300.0
 """Seconds after which a stream ends; the browser reconnects at once, and is admitted again or refused."""
@@ -51,7 +51,7 @@ class ServerSentEvent:
     id: str | None = None
 
 
-Look = Callable[[], Sequence[ServerSentEvent] | None]
+Poll = Callable[[], Sequence[ServerSentEvent] | None]
 """The events since the last call; None at the end of the stream. Runs in a thread, where the database may be used."""
 
 
@@ -62,29 +62,29 @@ def last_id(request: Request) -> str:
 
 def stream(
     request: Request,
-    look: Look,
+    poll: Poll,
     interval: float = INTERVAL,
     *,
     stored: bool = False,
     during: AbstractContextManager[object] | None = None,
 ) -> StreamingResponse:
-    """The events that ``look`` finds, every ``interval`` seconds, until it returns None or the server ends; ``stored``: it reads the store.
+    """The events that ``poll`` finds, every ``interval`` seconds, until it returns None or the server ends; ``stored``: it reads the store.
 
-    ``during``: a block around all looks.
+    ``during``: a block around all polls.
 
-    It also ends where its reader would not be admitted any more: a deleted key, a session that is over. The browser comes back, and is
+    It also ends where its reader would not be admitted any more: a deleted key, an expired session. The browser comes back, and is
     sent to the login.
     """
     actor = actor_of(request)
     access: Access = request.app.state.access
-    given = "" if "authorization" in request.headers else session(request)
+    token = "" if "authorization" in request.headers else session(request)
 
     def admitted() -> bool:
-        return access.still_admits(actor, given)
+        return access.still_admits(actor, token)
 
     headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no", "Cross-Origin-Resource-Policy": "same-origin"}
     calls = controller_of(request).access.followed if stored else None
-    events = _within(during or nullcontext(), _events(look, calls, interval, admitted, request.app.state.closing))
+    events = _within(during or nullcontext(), _events(poll, calls, interval, admitted, request.app.state.closing))
     return _Live(events, media_type="text/event-stream", headers=headers)
 
 
@@ -102,20 +102,20 @@ async def _within(block: AbstractContextManager[object], events: AsyncGenerator[
 
 
 async def _events(
-    look: Look, calls: StoreCalls | None, interval: float, admitted: Callable[[], bool], closing: threading.Event
+    poll: Poll, calls: StoreCalls | None, interval: float, admitted: Callable[[], bool], closing: threading.Event
 ) -> AsyncGenerator[bytes, None]:
-    begun = spoken = time.monotonic()
+    start = last_sent = time.monotonic()
     is_troubled, found = False, None
 
     def goes_on() -> bool:
-        return not closing.is_set() and time.monotonic() - begun < _LONGEST and admitted()
+        return not closing.is_set() and time.monotonic() - start < _LONGEST and admitted()
 
     yield format_sse_event(retry=1000, comment="Muster")
     while goes_on():
         try:
-            async for answer in looked_patiently(lambda: (look(),), calls, _PATIENCE):
-                if answer is not None:
-                    (found,) = answer
+            async for result in looked_patiently(lambda: (poll(),), calls, _PATIENCE):
+                if result is not None:
+                    (found,) = result
                 elif goes_on():
                     is_troubled = True
                     yield _written(ServerSentEvent("trouble", _SILENT))
@@ -134,10 +134,10 @@ async def _events(
             return
         if found:
             yield b"".join(map(_written, found))
-            spoken = time.monotonic()
-        elif time.monotonic() - spoken > _HEARTBEAT:
+            last_sent = time.monotonic()
+        elif time.monotonic() - last_sent > _HEARTBEAT:
             yield format_sse_event(comment="still here")
-            spoken = time.monotonic()
+            last_sent = time.monotonic()
         await asyncio.sleep(interval)
 
 
@@ -190,7 +190,7 @@ class Recent:
 
     Any thread may call.
 
-    ``most``: number of values; beyond it the one goes that was asked for longest ago.
+    ``most``: number of values; beyond it the one goes that was requested longest ago.
     """
 
     def __init__(self, seconds: float = INTERVAL * 0.9, most: int = _MOST_KEPT) -> None:

@@ -32,7 +32,7 @@ def log_in(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Open a session for a key; no cookie and no page keeps the key itself."""
     access: Access = request.app.state.access
     limit: RateLimit = request.app.state.limit
-    there = _own(form.one("next", "/"))
+    address = _own(form.one("next", "/"))
     try:
         token = access.sign_in(form.one("key").strip())
     except Refusal:
@@ -40,12 +40,12 @@ def log_in(request: Request, form: Form = Depends(sent_form)) -> Response:
         problem = (
             wait or "this key is not known here; `muster keys list` shows the keys, `muster keys create NAME` makes one"
         )
-        return render(request, "login.html", 429 if wait else 403, next=there, problem=problem)
-    answer = RedirectResponse(there, 303)
+        return render(request, "login.html", 429 if wait else 403, next=address, problem=problem)
+    response = RedirectResponse(address, 303)
     secure = request.url.scheme == "https"
     name = cookie_name(request.scope["server"][1])
-    answer.set_cookie(name, token, max_age=SESSION, httponly=True, samesite="strict", secure=secure, path="/")
-    return answer
+    response.set_cookie(name, token, max_age=SESSION, httponly=True, samesite="strict", secure=secure, path="/")
+    return response
 
 
 @router.post(LOGOUT)
@@ -53,14 +53,12 @@ def log_out(request: Request) -> Response:
     """Close the session."""
     access: Access = request.app.state.access
     access.sign_out(session(request))
-    answer = RedirectResponse(LOGIN, 303)
-    answer.delete_cookie(cookie_name(request.scope["server"][1]), httponly=True, samesite="strict", path="/")
-    return answer
+    response = RedirectResponse(LOGIN, 303)
+    response.delete_cookie(cookie_name(request.scope["server"][1]), httponly=True, samesite="strict", path="/")
+    return response
 
 
 def _own(address: str) -> str:
     """The address if it is a path of this server, else ``/``: a login must not lead to another server."""
-    is_own = (
-        re.fullmatch(r"/(?![/\\])[!-\[\]-~]*", address) is not None
-    )  # no other host, no backslash, no control character
+    is_own = re.fullmatch(r"/(?![/\\])[!-\[\]-~]*", address)  # no other host, no backslash, no control character
     return address if is_own and not address.startswith(LOGIN) else "/"

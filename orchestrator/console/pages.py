@@ -59,7 +59,7 @@ NAVIGATION = (
 
 
 def _template_folders() -> list[Path]:
-    """The folder of the console's templates, and those of plug-ins. Raises PluginError: one is not there, or hides another's template."""
+    """The folder of the console's templates, and those of plug-ins. Raises PluginError: one is missing, or hides another's template."""
     found = [Path(__file__).parent / "templates"]
     for name, package in ((name, plugin.templates) for name, plugin in plugins().items() if plugin.templates):
         folders = [Path(place) / "templates" for place in getattr(load(package), "__path__", ())]
@@ -70,7 +70,7 @@ def _template_folders() -> list[Path]:
             )
         for template, before in product(sorted(added), found):
             if (before / template).exists():
-                raise PluginError(f"plug-in {name}: the template {template} is there already, in {before}; rename it")
+                raise PluginError(f"plug-in {name}: the template {template} already exists, in {before}; rename it")
         found += folders
     return found
 
@@ -145,8 +145,8 @@ def form_token(request: Request) -> str:
 def session(request: Request) -> str:
     """The session of the request; empty where it has none."""
     access: Access = request.app.state.access
-    given = session_of(request.headers, request.scope["server"][1])
-    return given if access.session(given) is not None else ""
+    token = session_of(request.headers, request.scope["server"][1])
+    return token if access.session(token) is not None else ""
 
 
 def _navigation(actor: Actor) -> list[NavigationEntry]:

@@ -35,11 +35,11 @@ def queues(request: Request, queue: str = Query(default="", max_length=128)) -> 
 @router.get("/queues/stream")
 def queues_stream(request: Request, queue: str = Query(default="", max_length=128)) -> Response:
     """The changes in the tables, as events."""
-    live, look = (
+    live, read = (
         LiveParts(request, "queues_live.html"),
         partial(_tables, controller_of(request), actor_of(request), queue),
     )
-    return stream(request, lambda: live.changes(look()))
+    return stream(request, lambda: live.changes(read()))
 
 
 def _tables(controller: Controller, actor: Actor, queue: str) -> dict[str, Any]:

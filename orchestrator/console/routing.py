@@ -26,11 +26,11 @@ class PageRoute(APIRoute):
     def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
         handler = super().get_route_handler()
 
-        async def answer(request: Request) -> Response:
+        async def respond(request: Request) -> Response:
             try:
                 return await handler(request)
             except Unconfirmed as question:
-                return question.answer(request)
+                return question.response(request)
             except RequestValidationError as error:
                 first = error.errors()[0]
                 name = ".".join(map(str, first["loc"][1:])) or str(first["loc"][0])
@@ -42,7 +42,7 @@ class PageRoute(APIRoute):
             except (Unavailable, PluginError) as error:
                 return failure(request, str(error), 503 if isinstance(error, Unavailable) else 500, "ServerException")
 
-        return answer
+        return respond
 
 
 class StoredPageRoute(PageRoute, StoreRoute):
@@ -67,14 +67,14 @@ def page_router(*repeatable: str, stored: bool = False) -> APIRouter:
 
 
 def finish(app: FastAPI) -> None:
-    """Answer browsers with a page at unknown addresses."""
+    """Respond to browsers with a page at unknown addresses."""
     before: Any = app.exception_handlers[HTTPException]
 
     async def not_found(request: Request, error: Exception) -> Response:
         assert isinstance(error, HTTPException)
         if wants_page(request):
             return failure(request, f"{request.url.path[:200]}: {error.detail}", error.status_code)
-        answer: Response = await before(request, error)
-        return answer
+        response: Response = await before(request, error)
+        return response
 
     app.add_exception_handler(HTTPException, not_found)

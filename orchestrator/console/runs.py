@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import urlencode
 
 from fastapi import Query, Request, Response
@@ -27,21 +27,20 @@ router = page_router(stored=True)
 ROWS = 50
 """Runs of a page."""
 _INTERVAL = 2.0
-"""Seconds between two looks at the list, which reads several files of each run."""
+"""Seconds between two polls of the list, which reads several files of each run."""
 METRICS = (
     *("reward", "episode_length", "success", "steps_per_second"),
     *(metric.name for metric in LEARNING),
 )
 """Metrics that the page of a run draws, where the run has them; the page of its job has all."""
 _AXES = ("env_steps", "total_seconds")
+_Name = Annotated[str, Query(max_length=128)]
 _listed = Recent(_INTERVAL * 0.9)
 _recent = Recent()
 
 
 @router.get("/runs")
-def runs(
-    request: Request, search: str = Query(default="", max_length=128), after: str = Query(default="", max_length=128)
-) -> Response:
+def runs(request: Request, search: _Name = "", after: _Name = "") -> Response:
     """The list, by name, a page at a time."""
     rows = _window(controller_of(request), actor_of(request), search, after)
     return render(
@@ -56,13 +55,11 @@ def runs(
 
 
 @router.get("/streams/runs")  # not below /runs/, where it would hide a run of that name
-def runs_stream(
-    request: Request, search: str = Query(default="", max_length=128), after: str = Query(default="", max_length=128)
-) -> Response:
+def runs_stream(request: Request, search: _Name = "", after: _Name = "") -> Response:
     """The changes in a page of the list, as events."""
     live = LiveParts(request, "runs_live.html")
-    look = partial(_window, controller_of(request), actor_of(request), search, after)
-    return stream(request, lambda: live.changes({"runs": look()}), _INTERVAL, stored=True)
+    read = partial(_window, controller_of(request), actor_of(request), search, after)
+    return stream(request, lambda: live.changes({"runs": read()}), _INTERVAL, stored=True)
 
 
 @router.get("/runs/{name}")
@@ -97,9 +94,9 @@ def run_stream(request: Request, name: str) -> Response:
 
 def _window(controller: Controller, actor: Actor, search: str, after: str) -> Table:
     """A page of the list, by the runs' names; open pages with the same choice share it."""
-    look = partial(list_runs, controller, actor, after, ROWS, search)
+    read = partial(list_runs, controller, actor, after, ROWS, search)
     return _listed.get(
-        (id(controller), actor, search, after), lambda: Table((each["run"], _row(each)) for each in look())
+        (id(controller), actor, search, after), lambda: Table((each["run"], _row(each)) for each in read())
     )
 
 
@@ -107,7 +104,7 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], list[str], d
     """A run as the API describes it, its metrics that are drawn, and the live parts; its open pages share them. Raises ClientError."""
     controller, actor = controller_of(request), actor_of(request)
 
-    def look() -> tuple[dict[str, Any], list[str], dict[str, Any]]:
+    def read() -> tuple[dict[str, Any], list[str], dict[str, Any]]:
         found, run = run_routes.run_detail(request, name), controller.access.store.run(name)
         newest = last_metrics(run) or {}
         metrics = [each for each in METRICS if isinstance(newest.get(each), int | float)]
@@ -130,7 +127,7 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], list[str], d
         }
         return found, metrics, parts
 
-    return _recent.get((id(controller), actor, name), look)
+    return _recent.get((id(controller), actor, name), read)
 
 
 def _row(run: Mapping[str, Any]) -> dict[str, Any]:

@@ -56,17 +56,17 @@ def help_at(text: str, line: int) -> dict[str, Any]:
 
     Returns:
         ``section``: its key path, empty for the job itself; ``key``: help for the key itself, or None; ``keys``: help for those
-        of the section. Help is ``name``, ``about``, ``given``: whether the text has it.
+        of the section. Help is ``name``, ``about``, ``present``: whether the text has it.
     """
     document, path = _place(text, line)
     about = _about(path, document)
     section = next(path[:end] for end in range(len(path), -1, -1) if _keys(_about(path[:end], document)))
     written = _value(document, section)
     keys = [
-        {"name": name, "about": in_one_line(each), "given": isinstance(written, Mapping) and name in written}
+        {"name": name, "about": in_one_line(each), "present": isinstance(written, Mapping) and name in written}
         for name, each in _keys(_about(section, document)).items()
     ]
-    key = {"name": ".".join(map(str, path)), "about": in_one_line(about), "given": True} if path and about else None
+    key = {"name": ".".join(map(str, path)), "about": in_one_line(about), "present": True} if path and about else None
     return {"section": ".".join(map(str, section)), "key": key, "keys": keys}
 
 

@@ -15,10 +15,10 @@ async function draw() {
   const url = new URL(region.dataset.curves, location.origin);
   url.searchParams.set("metric", metric);
   try {
-    const answer = await fetch(url, { headers: { Accept: "application/json" } });
-    const data = await answer.json();
+    const response = await fetch(url, { headers: { Accept: "application/json" } });
+    const data = await response.json();
     if (mine !== chosen) return; // another metric was chosen meanwhile
-    if (!answer.ok) return show(data.message, true);
+    if (!response.ok) return show(data.message, true);
     if (!chart || drawn !== metric) {
       const figure = document.createElement("figure");
       region.replaceChildren(figure);
@@ -27,7 +27,7 @@ async function draw() {
     }
     chart.draw(data);
   } catch {
-    // the server is away; the next time draws again
+    // the server is unavailable; the next time draws again
   }
 }
 

@@ -18,26 +18,27 @@ export function showKept() {
 
 /**
  * Send fields to an address of this server; a question is asked first.
- * @returns {Promise<object|null>} the answer; null where the person said no, or the server refused (which is shown)
+ * @returns {Promise<object|null>} the response; null if the person cancelled, or the server refused (which is shown)
  */
-export async function send(address, fields) {
+async function send(address, fields) {
   const body = new URLSearchParams(fields);
   if (!body.has("form_token")) body.set("form_token", document.querySelector("meta[name=form-token]").content);
-  let answer;
+  let response;
   try {
-    answer = await fetch(address, { method: "POST", body, headers: { Accept: "application/json" } });
+    response = await fetch(address, { method: "POST", body, headers: { Accept: "application/json" } });
   } catch {
     show("the server can't be reached; try again", true);
     return null;
   }
-  const told = await answer.json().catch(() => ({ message: `${answer.status} ${answer.statusText}` }));
-  if (told.question) {
-    if (!(await ask(told.question))) return null;
+  const status = `${response.status} ${response.statusText}`;
+  const data = await response.json().catch(() => ({ message: status }));
+  if (data.question) {
+    if (!(await ask(data.question))) return null;
     body.set("confirmed", "yes");
     return send(address, body);
   }
-  if (answer.ok) return told;
-  show(told.message ?? `${answer.status} ${answer.statusText}`, true);
+  if (response.ok) return data;
+  show(data.message ?? status, true);
   return null;
 }
 
@@ -61,9 +62,9 @@ export function startForms() {
     const button = event.submitter;
     const fields = new FormData(form, button);
     if (button) button.disabled = true; // a second click sends nothing twice
-    const told = await send(button?.getAttribute("formaction") ?? form.getAttribute("action"), fields);
+    const response = await send(button?.getAttribute("formaction") ?? form.getAttribute("action"), fields);
     if (button) button.disabled = false;
-    if (told) follow(told, form);
+    if (response) follow(response, form);
     else if (form.matches("[data-fields]")) blame(form);
   });
   for (const box of document.querySelectorAll("[data-mark-all]")) {
@@ -73,26 +74,25 @@ export function startForms() {
 
 /** The refusal stands at the field that its first word names, until something in the form is changed. */
 function blame(form) {
-  const told = document.querySelector("[data-message]").textContent;
-  const field = form.elements.namedItem(told.split(/[: ]/, 1)[0]);
+  const message = document.querySelector("[data-message]").textContent;
+  const field = form.elements.namedItem(message.split(/[: ]/, 1)[0]);
   if (!field?.setCustomValidity) return;
-  field.setCustomValidity(told);
+  field.setCustomValidity(message);
   field.reportValidity();
   form.addEventListener("input", () => field.setCustomValidity(""), { once: true });
 }
 
-function follow(told, form) {
-  const here = location.pathname + location.search;
-  if (told.location && told.location !== here) {
-    if (told.message) sessionStorage.setItem(KEPT, told.message);
-    location.assign(told.location);
+function follow({ location: address, message = "" }, form) {
+  if (address && address !== location.pathname + location.search) {
+    if (message) sessionStorage.setItem(KEPT, message);
+    location.assign(address);
     return;
   }
-  show(told.message ?? "");
+  show(message);
   if (form.matches("[data-bulk]")) markAll(false);
 }
 
 function markAll(isMarked) {
-  for (const box of document.querySelectorAll("[data-rows] input[type=checkbox]")) box.checked = isMarked && !box.hidden;
+  for (const box of document.querySelectorAll("[data-rows] input[type=checkbox]")) box.checked = isMarked;
   for (const box of document.querySelectorAll("[data-mark-all]")) box.checked = isMarked;
 }

@@ -42,44 +42,44 @@ export class JobLog {
 
   /** The last lines. */
   async load() {
-    const told = await this.#read({});
-    if (told) this.replace(told);
+    const window = await this.#read({});
+    if (window) this.replace(window);
   }
 
   /** A window at the end of the log in place of what is shown. */
-  replace(told) {
+  replace(window) {
     this.isAtEnd = true;
-    this.#put(told);
-    if (told.skipped) this.state.textContent = `${size(told.skipped)} came at once and are left out here; read them with Earlier lines`;
+    this.#put(window);
+    if (window.skipped) this.state.textContent = `${size(window.skipped)} arrived at once and are left out here; Earlier lines reads them`;
     this.place.scrollTop = this.place.scrollHeight;
   }
 
   /** New lines of the stream. */
-  add(told) {
+  add(window) {
     const before = this.last;
-    this.last = told.last;
+    this.last = window.last;
     if (this.isAtEnd && this.#count() > 2 * MOST) {
       // the person reads what is further up: these lines wait
       this.isAtEnd = this.buttons.later.hidden = this.buttons.follow.hidden = false;
       this.end = before;
     }
     if (!this.isAtEnd) {
-      this.state.textContent = "New lines have come.";
+      this.state.textContent = "There are new lines.";
       return;
     }
     const isBelow = this.place.scrollHeight - this.place.scrollTop - this.place.clientHeight < NEAR;
-    this.place.append(block(told.lines));
+    this.place.append(block(window.lines));
     if (!isBelow) return;
     this.#trim();
     this.place.scrollTop = this.place.scrollHeight;
   }
 
-  #put(told) {
-    [this.first, this.end] = [told.first, told.last];
-    if (this.isAtEnd) this.last = told.last;
-    this.place.replaceChildren(block(told.lines));
-    this.state.textContent = told.lines.length ? "" : "There are no lines yet.";
-    this.buttons.earlier.hidden = !told.more;
+  #put(window) {
+    [this.first, this.end] = [window.first, window.last];
+    if (this.isAtEnd) this.last = window.last;
+    this.place.replaceChildren(block(window.lines));
+    this.state.textContent = window.lines.length ? "" : "There are no lines yet.";
+    this.buttons.earlier.hidden = !window.more;
     this.buttons.later.hidden = this.buttons.follow.hidden = this.isAtEnd;
   }
 
@@ -103,36 +103,36 @@ export class JobLog {
       await this.load();
       this.isAtEnd = true;
     }
-    const told = await this.#read({ before: JSON.stringify(this.first) });
-    if (!told) return;
+    const window = await this.#read({ before: JSON.stringify(this.first) });
+    if (!window) return;
     const height = this.place.scrollHeight;
-    this.place.prepend(block(told.lines));
-    this.first = told.first;
-    this.buttons.earlier.hidden = !told.more;
+    this.place.prepend(block(window.lines));
+    this.first = window.first;
+    this.buttons.earlier.hidden = !window.more;
     this.place.scrollTop += this.place.scrollHeight - height;
   }
 
   async #later() {
-    const told = await this.#read({ after: JSON.stringify(this.end) });
-    if (!told) return;
-    this.place.append(block(told.lines));
-    this.end = told.last;
-    if (!told.more) {
+    const window = await this.#read({ after: JSON.stringify(this.end) });
+    if (!window) return;
+    this.place.append(block(window.lines));
+    this.end = window.last;
+    if (!window.more) {
       await this.load();
       this.filtered();
     }
   }
 
   async #apply() {
-    const given = new FormData(this.form);
-    const filter = Object.fromEntries(["node", "rank", "attempt"].map((name) => [name, given.get(name).trim()]));
+    const fields = new FormData(this.form);
+    const filter = Object.fromEntries(["node", "rank", "attempt"].map((name) => [name, fields.get(name).trim()]));
     const isOther = JSON.stringify(filter) !== JSON.stringify({ node: "", rank: "", attempt: "", ...this.filter });
     this.filter = filter;
     if (isOther || !this.isAtEnd) {
       await this.load();
       this.filtered();
     }
-    const text = given.get("text");
+    const text = fields.get("text");
     if (text) await this.#find(text);
     else this.#endSearch();
   }
@@ -149,14 +149,14 @@ export class JobLog {
     const search = this.search;
     let place = "{}";
     let count = 0;
-    for (let part = 1; part <= SEARCHED; part++) {
-      this.state.textContent = `Searching, part ${part} …`;
-      const told = await this.#read({ text, place }, "/search");
-      if (!told || search !== this.search) return;
-      told.lines.forEach((line, i) => this.#hit(line, told.positions[i]));
-      count += told.lines.length;
-      place = JSON.stringify(told.place);
-      if (told.over || count >= 100) break;
+    for (let number = 1; number <= SEARCHED; number++) {
+      this.state.textContent = `Searching, part ${number} …`;
+      const part = await this.#read({ text, place }, "/search");
+      if (!part || search !== this.search) return;
+      part.lines.forEach((line, i) => this.#hit(line, part.positions[i]));
+      count += part.lines.length;
+      place = JSON.stringify(part.place);
+      if (part.over || count >= 100) break;
     }
     const what = text ? "lines with this text" : "errors, the first of each log";
     this.state.textContent = count ? `${count}${count >= 100 ? " or more" : ""} ${what}` : `No ${text ? "line has this text" : "line looks like an error"}.`;
@@ -181,24 +181,24 @@ export class JobLog {
     this.form.elements.node.value = node;
     this.form.elements.rank.value = "";
     this.form.elements.attempt.value = attempt;
-    const told = await this.#read({ around: JSON.stringify({ [`${attempt}/${node}`]: position }) });
-    if (!told) return;
+    const window = await this.#read({ around: JSON.stringify({ [`${attempt}/${node}`]: position }) });
+    if (!window) return;
     this.isAtEnd = false;
-    this.#put(told);
+    this.#put(window);
     const shown = [...this.place.querySelectorAll(".line")];
-    const there = shown.find((each) => each.dataset.time === time && each.lastElementChild.textContent === clean(text));
-    there?.classList.add("hit");
-    there?.scrollIntoView({ block: "center" });
+    const hit = shown.find((each) => each.dataset.time === time && each.lastElementChild.textContent === clean(text));
+    hit?.classList.add("hit");
+    hit?.scrollIntoView({ block: "center" });
   }
 
   async #read(query, path = "") {
     const url = new URL(this.address + path, location.origin);
     for (const [name, value] of Object.entries({ ...this.filter, ...query })) if (value) url.searchParams.set(name, value);
     try {
-      const answer = await fetch(url, { headers: { Accept: "application/json" } });
-      const told = await answer.json();
-      if (answer.ok) return told;
-      show(told.message ?? `${answer.status}`, true);
+      const response = await fetch(url, { headers: { Accept: "application/json" } });
+      const data = await response.json();
+      if (response.ok) return data;
+      show(data.message ?? `${response.status}`, true);
     } catch {
       show("the server can't be reached; try again", true);
     }

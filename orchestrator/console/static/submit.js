@@ -2,6 +2,7 @@
 import { Editor } from "./editor.js";
 
 const PAUSE = 350;
+const NOWHERE = { key: "", line: 0, code_line: 0 };
 
 class Checked {
   constructor(form) {
@@ -46,15 +47,15 @@ class Checked {
     if (this.yaml) body.set("line", (this.line = this.yaml.line));
     try {
       const headers = { Accept: "application/json" };
-      const answer = await fetch(this.form.dataset.check, { method: "POST", body, headers, signal: asking.signal });
-      const told = await answer.json();
-      this.tell(answer.ok ? told : { problem: { message: told.message, key: "", line: 0, code_line: 0 } });
+      const response = await fetch(this.form.dataset.check, { method: "POST", body, headers, signal: asking.signal });
+      const data = await response.json();
+      this.report(response.ok ? data : { problem: { ...NOWHERE, message: data.message } });
     } catch (error) {
-      if (error.name !== "AbortError") this.tell({ problem: { message: "the server can't be reached", key: "", line: 0, code_line: 0 } });
+      if (error.name !== "AbortError") this.report({ problem: { ...NOWHERE, message: "the server can't be reached" } });
     }
   }
 
-  tell({ yaml, problem, notes = [], help }) {
+  report({ yaml, problem, notes = [], help }) {
     const shown = this.form.querySelector("[data-yaml]");
     if (shown && yaml !== undefined) shown.textContent = yaml;
     const words = problem ? (problem.key ? `${problem.key}: ` : "") + problem.message : "";
@@ -92,7 +93,7 @@ class Checked {
     place.querySelector("dl").replaceChildren(...keys.map((each) => {
       const name = element("dt", "");
       name.append(element("code", each.name));
-      name.className = each.given ? "given" : "";
+      name.className = each.present ? "present" : "";
       const pair = element("div", "");
       pair.append(name, element("dd", each.about));
       return pair;

@@ -128,7 +128,7 @@ def test_any_job_is_submitted_as_yaml_with_help_for_the_line_and_its_errors_mark
     assert (told["problem"]["key"], told["problem"]["line"]) == ("train.wordls", 6)
     assert "did you mean worlds?" in told["problem"]["message"]
     keys = {each["name"]: each for each in told["help"]["keys"]}
-    assert told["help"]["section"] == "train" and keys["task"]["given"] and not keys["seed"]["given"]
+    assert told["help"]["section"] == "train" and keys["task"]["present"] and not keys["seed"]["present"]
     assert "name of a task" in told["help"]["key"]["about"]
     answer = visitor.http.post("/submit/review", data={"form_token": visitor.page("/").form_token, "yaml": text})
     assert answer.status_code == 400 and Page(answer.text).all("div", **{"data-line": "6"})

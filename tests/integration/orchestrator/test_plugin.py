@@ -238,7 +238,7 @@ def test_a_template_that_hides_another_is_refused(tmp_path: Path) -> None:
     (tmp_path / "tally_pages" / "templates" / "job.html").touch()
     done = run_muster("serve", home=tmp_path, PYTHONPATH=str(tmp_path))
     assert (done.returncode, done.stderr.count("\n")) == (1, 1)
-    assert done.stderr.startswith("muster: plug-in tally: the template job.html is there already, in ")
+    assert done.stderr.startswith("muster: plug-in tally: the template job.html already exists, in ")
 
 
 def test_a_rank_ends_with_one_line_where_a_part_can_t_be_used(tmp_path: Path) -> None:

@@ -69,8 +69,8 @@ def test_help_is_of_the_section_in_which_the_line_stands(line: int) -> None:
 def test_help_says_what_a_key_is_and_which_are_given_also_in_what_is_not_yaml_yet() -> None:
     found = help_at(JOB, 5)
     about = "simulated worlds of each rank; integer from 1"
-    assert found["key"] == {"name": "train.worlds", "about": about, "given": True}
-    assert [each["name"] for each in found["keys"] if each["given"]] == ["task", "worlds", "config", "ppo"]
+    assert found["key"] == {"name": "train.worlds", "about": about, "present": True}
+    assert [each["name"] for each in found["keys"] if each["present"]] == ["task", "worlds", "config", "ppo"]
     assert help_at("name: x\ntrain:\n  task: Ant\n  wor: [", 4)["section"] == "train"
     assert help_at("name: [", 1)["section"] == "" == help_at("", 1)["section"]
 
