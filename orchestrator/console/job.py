@@ -43,7 +43,7 @@ def job(request: Request, reference: str) -> Response:
     detail = job_detail(request, reference)
     if detail["id"] != reference:
         return RedirectResponse(f"/jobs/{detail['id']}", 303)
-    described = batch.call(controller, actor, "DescribeJobs", {"jobs": [detail["id"]]})["jobs"][0]
+    described = _described(controller, actor, detail["id"])
     definition = described["jobDefinition"].rpartition("/")[2]
     stored = _Stored(detail["spec"] or {})
     if detail["storeProblem"] is None:
@@ -82,19 +82,13 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
     log = LiveLog(controller.logs, chosen, chosen.end() if places is None else places)
     live = LiveParts(request, "run_live.html", **_context(request, chosen.job))
     iterations = NewIterations(chosen.run, iteration)
-    definition = batch.call(controller, actor, "DescribeJobs", {"jobs": [chosen.job]})["jobs"][0]["jobDefinition"]
+    definition = _described(controller, actor, chosen.job)["jobDefinition"].rpartition("/")[2]
     is_over = False
 
-    def read() -> tuple[bool, bool, dict[str, Any]]:
+    def read() -> tuple[dict[str, Any], dict[str, Any]]:
         detail = job_detail(request, chosen.job)
-        checkpoints = _checkpoints(controller, actor, detail)
         view = views.state(chosen.job, is_seen=True)
-        has_run = detail["results"] is not None
-        return (
-            Status(detail["status"]).is_terminal,
-            has_run,
-            _parts(detail, definition.rpartition("/")[2], view, checkpoints),
-        )
+        return detail, _parts(detail, definition, view, _checkpoints(controller, actor, detail))
 
     def changes() -> Sequence[ServerSentEvent] | None:
         """The events since the last read; None once the job is over and all its events have been sent."""
@@ -102,8 +96,9 @@ def job_stream(request: Request, reference: str, chosen: ChosenLog) -> Response:
         if is_over:
             return None
         # before the log: nothing is written after the end
-        has_ended, has_run, parts = _recent.get((id(controller), actor, chosen.job), read)
-        events = live.changes(parts) + (iterations.changes() if has_run else [])
+        detail, parts = _recent.get((id(controller), actor, chosen.job), read)
+        has_ended = Status(detail["status"]).is_terminal
+        events = live.changes(parts) + (iterations.changes() if detail["results"] is not None else [])
         lines, is_behind = log.changes(is_last=has_ended)
         events += [lines] if lines else []
         is_over = has_ended and not is_behind
@@ -131,21 +126,28 @@ def _read(controller: Controller, actor: Actor, detail: Mapping[str, Any]) -> _S
     return _Stored(spec, before_it(controller, actor, detail), files, _checkpoints(controller, actor, detail))
 
 
+def _described(controller: Controller, actor: Actor, job_id: str) -> dict[str, Any]:
+    """A job as the AWS Batch API describes it."""
+    described: dict[str, Any] = batch.call(controller, actor, "DescribeJobs", {"jobs": [job_id]})["jobs"][0]
+    return described
+
+
 def _context(request: Request, job_id: str) -> dict[str, Any]:
     """What the macros of the live parts need beside the parts."""
     return {"id": job_id, "is_near": is_near(request), "marks": may_change(actor_of(request))}
 
 
 def _parts(detail: Mapping[str, Any], definition: str, view: JobViewState, checkpoints: Table) -> dict[str, Any]:
-    """The live parts of the page; with a run there is more to see, and a frame needs a policy of its own."""
+    """The live parts of the page. It is loaded again once there is a run to see, and for a frame, which needs a policy of its own."""
     head = headline_of(detail)
+    page = f"{'' if detail['results'] is None else 'with a run'} {view.text}"
     return {
         "headline": head,
         "show_view": head["isOver"],
         "facts": facts_of_job(detail, definition),
         "attempts": attempts_of(detail),
         "checkpoints": checkpoints,
-        "page": f"{'' if detail['results'] is None else 'with a run'} {view.text}",
+        **({"page": page} if detail["storeProblem"] is None else {}),  # a store that is silent hides no run
     }
 
 

@@ -18,7 +18,8 @@ from orchestrator.console.pages import render
 from orchestrator.console.routing import page_router
 from orchestrator.console.run_parts import checkpoints_of, evaluations_of, learning_facts
 from orchestrator.control.controller import Controller
-from orchestrator.services.permissions import Actor
+from orchestrator.services.context import permitted_run
+from orchestrator.services.permissions import Actor, Operation
 from orchestrator.services.runs import last_metrics, list_runs
 from shared_store.volume.learning_metrics import LEARNING
 
@@ -105,7 +106,10 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], list[str], d
     controller, actor = controller_of(request), actor_of(request)
 
     def read() -> tuple[dict[str, Any], list[str], dict[str, Any]]:
-        found, run = run_routes.run_detail(request, name), controller.access.store.run(name)
+        found, run = (
+            run_routes.run_detail(request, name),
+            permitted_run(controller, actor, name, Operation.READ_CHECKPOINTS),
+        )
         newest = last_metrics(run) or {}
         metrics = [each for each in METRICS if isinstance(newest.get(each), int | float)]
         train = _train(found)
@@ -120,7 +124,7 @@ def _read_run(request: Request, name: str) -> tuple[dict[str, Any], list[str], d
         ]
         parts = {
             "facts": facts,
-            "page": "with curves" if metrics else "",
+            **({"page": "with curves"} if metrics else {}),
             "jobs": Table((job["id"], job) for job in found["jobs"][::-1]),
             "checkpoints": checkpoints_of(run),
             "evaluations": evaluations_of(run_routes.run_evaluations(request, name)[::-1], name),

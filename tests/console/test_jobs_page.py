@@ -31,6 +31,13 @@ def test_two_people_see_changes_and_a_reader_has_no_buttons(console: Console, pe
         expect(row(each, job)).to_contain_text("shared")
     expect(other.page.get_by_role("button", name="Stop marked")).to_have_count(0)
     row(one, job).get_by_role("checkbox").check()
+    row(one, job).get_by_role("link").focus()
+    later = console.submit(waiting, "shared-later")
+    expect(row(one, later)).to_be_visible()
+    console.client.batch("TerminateJob", jobId=later, reason="seen")
+    expect(row(one, later).locator(".badge")).to_have_text("FAILED")
+    expect(row(one, job).get_by_role("link")).to_be_focused()
+    expect(row(one, job).get_by_role("checkbox")).to_be_checked()
     one.click("Stop marked")
     one.confirm()
     for each in (one, other):

@@ -36,7 +36,6 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     job = submit(person, "Cartpole", SMALL)
     watches_the_curve_grow(person)
     person.picture("job")
-    reads_the_log(person)
     saves_and_stops(person)
     resumed = resumes(person)
     server.client.batch("TerminateJob", jobId=resumed, reason="seen")
@@ -54,7 +53,6 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     page.get_by_label("Name of a clone, or of a model").fill("balancer")
     person.click("Register as a model")
     expect(page.locator("[data-message]")).to_contain_text(f"@{iteration} as balancer@1")
-    clones(person)
     compares(person)
     page.goto("/models")
     person.click("balancer")
@@ -63,7 +61,7 @@ def test_a_training_goes_from_the_wizard_to_a_registered_model_by_clicking(serve
     expect(page.locator("main")).to_contain_text("Every file is as it was registered.")
     person.picture("model")
     page.goto("/")
-    expect(page.locator("tr[data-key]")).to_have_count(5)
+    expect(page.locator("tr[data-key]")).to_have_count(4)
     person.picture("jobs")
 
 
@@ -74,18 +72,6 @@ def watches_the_curve_grow(person: Person) -> None:
     progress = person.page.locator(".headline progress")
     seen = float(progress.get_attribute("value") or 0)
     person.page.wait_for_function("seen => document.querySelector('.headline progress').value > seen + 3", arg=seen)
-
-
-def reads_the_log(person: Person) -> None:
-    log = person.page.get_by_role("log")
-    expect(log.locator(".line").first).to_be_visible()
-    person.page.locator("[data-log-filter]").get_by_label("Search").fill("iteration")
-    person.click("Apply")
-    expect(person.page.locator("[data-found] button").first).to_be_visible()
-    person.page.locator("[data-found] button").first.click()
-    expect(log.locator(".line.hit")).to_be_visible()
-    person.click("Back to the end")
-    expect(person.page.locator("[data-follow]")).to_be_hidden()
 
 
 def saves_and_stops(person: Person) -> None:
@@ -109,25 +95,11 @@ def resumes(person: Person) -> str:
     return job
 
 
-def clones(person: Person) -> None:
-    page = person.page
-    newest(person)
-    page.get_by_label("Name of a clone, or of a model").fill("twin")
-    page.get_by_label("Changes of a clone").fill("train.seed=2\ntrain.iterations=3")
-    person.leave("Clone")
-    ended(person)
-    configuration = page.get_by_role("region", name="Differences")
-    expect(configuration).to_contain_text("train.seed")
-
-
 def compares(person: Person) -> None:
-    """The two runs, which differ in their seed and length, as `muster compare` does it."""
+    """The curve of the run, from the list of runs."""
     page = person.goto("/runs")
-    marks = page.get_by_role("region", name="Runs").locator("tr[data-key^=pole] input, tr[data-key^=twin] input")
-    expect(marks).to_have_count(2)
-    for mark in marks.all():
-        mark.check()
+    page.get_by_role("region", name="Runs").locator("tr[data-key^=pole] input").check()
     person.leave("Compare marked")
-    expect(page.get_by_role("region", name="Runs").locator("tbody tr")).to_have_count(2)
-    expect(page.locator(".one-chart svg path, .one-chart svg polyline").first).to_be_visible()
+    expect(page.get_by_role("region", name="Runs").locator("tbody tr")).to_have_count(1)
+    expect(page.locator(".one-chart svg path").first).to_be_visible()
     person.picture("compare")

@@ -327,52 +327,36 @@ def test_the_page_of_an_array_leads_to_its_jobs(console: Console, store: Store) 
 
 
 OPEN = "import time; print('note: 2 worlds'); print('the view is at http://127.0.0.1:9', flush=True); time.sleep(600)"
-SHOWN = JobViewState(url="http://127.0.0.1:9")
+LEFT = "print('muster: the training is on another machine'); raise SystemExit(1)"
+SHOWN, CLOSED = JobViewState(url="http://127.0.0.1:9"), JobViewState()
 
 
-def script(text: str) -> list[str]:
-    return [sys.executable, "-c", text]
-
-
-def shown(views: Views, job: str, state: JobViewState) -> None:
+def start(views: Views, job: str, text: str, state: JobViewState) -> None:
+    """Start a view by a script, and wait for its state."""
+    views.start(job, [sys.executable, "-c", text])
     wait_for(lambda: views.state(job) == state, 20, f"{job}: {state}")
 
 
 def test_a_view_is_open_until_it_is_closed_and_a_server_has_two_at_once() -> None:
     views = Views()
-    assert views.state("a") == JobViewState()
-    views.start("a", script(OPEN))
-    views.start("b", script(OPEN))
-    assert views.state("a").text == "starting"
-    for job in ("a", "b"):
-        shown(views, job, SHOWN)
-    views.start("a", script("raise SystemExit(3)"))
-    assert views.state("a") == SHOWN, "it is open already"
+    assert views.state("a") == CLOSED
+    for job in ("a", "b", "a"):
+        start(views, job, OPEN, SHOWN)
     with pytest.raises(ClientError, match="2 live views are open on this server; close one first"):
-        views.start("c", script(OPEN))
-    views.end("a")
-    shown(views, "a", JobViewState())
-    views.start("c", script(OPEN))
-    shown(views, "c", SHOWN)
-    for job in ("b", "c", "nobody's"):
+        start(views, "c", OPEN, SHOWN)
+    for job in ("a", "b", "nobody's"):
         views.end(job)
-        shown(views, job, JobViewState())
-
-
-def test_the_reason_of_a_view_that_ends_is_its_last_line() -> None:
-    views = Views()
-    views.start("a", script("print('muster: the training is on another machine'); raise SystemExit(1)"))
-    shown(views, "a", JobViewState(problem="the training is on another machine"))
-    views.start("a", script("raise SystemExit(3)"))
-    shown(views, "a", JobViewState(problem="exit code 3"))
+        wait_for(lambda job=job: views.state(job) == CLOSED, 20, "its end")  # type: ignore[misc]
+    start(views, "c", LEFT, JobViewState(problem="the training is on another machine"))
+    start(views, "c", "raise SystemExit(3)", JobViewState(problem="exit code 3"))
 
 
 def test_a_view_ends_when_nobody_looks_at_its_page(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_view, "_UNSEEN", 2.0)
     views = Views()
-    views.start("a", script(OPEN))
-    wait_for(lambda: views.state("a", is_seen=True) == SHOWN, 20, "the view")
-    shown(views, "a", JobViewState())
+    start(views, "a", OPEN, SHOWN)
+    assert views.state("a", is_seen=True) == SHOWN
+    wait_for(lambda: views.state("a") == CLOSED, 20, "its end")
 
 
 @pytest.mark.parametrize(

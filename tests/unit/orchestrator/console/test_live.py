@@ -16,22 +16,19 @@ from fastapi import Request
 from orchestrator.api.http.access import Access
 from orchestrator.console import curves, live
 from orchestrator.console.curves import NewIterations
-from orchestrator.console.live import LiveParts, Recent, ServerSentEvent, Table, last_id, stream
+from orchestrator.console.live import LiveParts, Recent, ServerSentEvent, Table, stream
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import MetricsWriter, sampled
 
 
-def request_of(query: dict[str, str] | None = None, **headers: str) -> Request:
+def request_of(**headers: str) -> Request:
     state = SimpleNamespace(closing=threading.Event(), access=Access())
-    told = SimpleNamespace(
-        headers=headers,
-        query_params=query or {},
-        app=SimpleNamespace(state=state),
-        state=SimpleNamespace(actor=CONTROLLER),
+    request = SimpleNamespace(
+        headers=headers, app=SimpleNamespace(state=state), state=SimpleNamespace(actor=CONTROLLER)
     )
-    return cast(Request, told)
+    return cast(Request, request)
 
 
 def written(looks: Sequence[Callable[[], Sequence[ServerSentEvent] | None]]) -> list[str]:
@@ -91,11 +88,6 @@ def test_a_look_that_fails_is_told_and_the_stream_goes_on_to_its_end() -> None:
     ]
     assert 'data: ""' in blocks[2], "the trouble is over"
     assert "the run is gone" in blocks[1]
-
-
-def test_a_browser_says_what_it_has_in_a_header_or_in_the_address() -> None:
-    assert last_id(request_of({"last": "3"})) == "3" and last_id(request_of()) == ""
-    assert last_id(request_of({"last": "3"}, **{"last-event-id": "5"})) == "5"
 
 
 def test_a_value_that_takes_long_is_computed_for_a_fifth_of_the_time(monkeypatch: pytest.MonkeyPatch) -> None:
