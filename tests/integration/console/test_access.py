@@ -19,8 +19,8 @@ def test_a_browser_without_a_session_is_sent_to_the_login_and_back(console: Cons
     http = httpx.Client(base_url=console.url, headers={"Accept": "text/html"}, trust_env=False)
     sent = http.get("/?search=a%26b")
     assert sent.status_code == 303 and sent.headers["location"] == "/login?next=%2F%3Fsearch%3Da%2526b"
-    asked = Page(http.get(sent.headers["location"]).text)
-    (kept,) = asked.all("input", name="next")
+    question = Page(http.get(sent.headers["location"]).text)
+    (kept,) = question.all("input", name="next")
     answer = http.post("/login", data={"next": str(kept["value"]), "key": console.secrets["admin"]})
     assert answer.status_code == 303 and answer.headers["location"] == "/?search=a%26b"
     assert http.get("/?search=a%26b").status_code == 200
@@ -92,8 +92,8 @@ def test_a_stream_ends_with_its_readers_session(console: Console, way: str) -> N
         else:
             console.keys.delete("passing")
         assert "event: end" not in list(lines), "the browser comes back, and is asked who it is"
-    asked = other.head("/jobs/stream", headers={"Accept": "text/html"})
-    assert asked.status_code == 303 and asked.headers["location"].startswith("/login")
+    question = other.head("/jobs/stream", headers={"Accept": "text/html"})
+    assert question.status_code == 303 and question.headers["location"].startswith("/login")
     if way == "logout":
         console.keys.delete("passing")
     other.close()
@@ -179,8 +179,8 @@ def test_files_are_kept_for_ever_under_the_address_of_their_content_and_no_other
 
 def test_an_address_that_leads_nowhere_is_a_page_for_browsers_and_json_for_programs(visitor: Visitor) -> None:
     assert "Not Found" in visitor.page("/nowhere", 404).text
-    told = visitor.http.get("/nowhere", headers={"Accept": "*/*"})
-    assert told.status_code == 404 and told.json()["message"] == "GET /nowhere: Not Found"
+    result = visitor.http.get("/nowhere", headers={"Accept": "*/*"})
+    assert result.status_code == 404 and result.json()["message"] == "GET /nowhere: Not Found"
 
 
 # -- the page of keys --------------------------------------------------------------------------------------------------
@@ -224,11 +224,11 @@ def test_a_key_is_deleted_once_the_person_has_said_yes(console: Console) -> None
     bob, visitor = Visitor(console.url, secret_of(key)), console.visitor()
     stream = visitor.events("/keys/stream")
     assert "bob" in next(stream)[1]["keys"]["order"]
-    asked = visitor.submit("/keys/delete", name="bob")
-    assert asked.status_code == 409 and asked.json()["question"]["title"] == "Delete key bob?"
+    question = visitor.submit("/keys/delete", name="bob")
+    assert question.status_code == 409 and question.json()["question"]["title"] == "Delete key bob?"
     assert bob.http.get("/", follow_redirects=False).status_code == 200
-    told = visitor.submit("/keys/delete", name="bob", confirmed="yes").json()
-    assert told == {"location": "/keys", "message": "deleted key bob"}
+    result = visitor.submit("/keys/delete", name="bob", confirmed="yes").json()
+    assert result == {"location": "/keys", "message": "deleted key bob"}
     assert "bob" not in next(stream)[1]["keys"]["order"]
     stream.close()
     assert bob.http.get("/", follow_redirects=False).status_code == 303
@@ -263,8 +263,8 @@ def test_a_hostile_name_is_refused_as_text(console: Console, name: str) -> None:
 def test_the_first_key_is_made_after_a_warning_and_from_then_on_everybody_needs_one(tmp_path: Path) -> None:
     with Serving(tmp_path, "--cpus", "1") as server, contextlib.closing(Visitor(server.url)) as visitor:
         assert "There is no key" in visitor.page("/keys").text
-        asked = post(visitor, "/keys/create", name="first")
-        assert asked.status_code == 409 and "everybody needs a key, you too" in Page(asked.text).text
+        question = post(visitor, "/keys/create", name="first")
+        assert question.status_code == 409 and "everybody needs a key, you too" in Page(question.text).text
         made = post(visitor, "/keys/create", name="first", confirmed="yes")
         (key,) = HomeKeys(tmp_path).load().values()
         assert key.secret in made.text

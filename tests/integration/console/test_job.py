@@ -81,8 +81,8 @@ def log_of(visitor: Visitor, job: str, path: str = "", **query: Any) -> dict[str
     return found
 
 
-def said(told: dict[str, Any]) -> list[str]:
-    return [each[5] for each in told["lines"]]
+def texts(result: dict[str, Any]) -> list[str]:
+    return [each[5] for each in result["lines"]]
 
 
 def test_a_job_that_waits_says_why_and_shows_what_it_will_do(console: Console, training: str) -> None:
@@ -114,7 +114,7 @@ def test_an_ended_job_has_its_attempt_on_a_line_of_time_and_how_each_node_ended(
 def test_what_a_job_says_is_text_wherever_it_is_shown(console: Console, talking: str, store: Store) -> None:
     visitor = console.visitor()
     answer = visitor.http.get(f"/jobs/{talking}/log/search", params={"text": "ALERT(1)", "node": "0"})
-    assert answer.headers["content-type"] == "application/json" and HOSTILE in said(answer.json())
+    assert answer.headers["content-type"] == "application/json" and HOSTILE in texts(answer.json())
     waiting = console.submit(console.register("hostile"), "hostile")
     console.client.batch("TerminateJob", jobId=waiting, reason=HOSTILE)
     await_status(console.client, waiting, "FAILED")
@@ -132,10 +132,10 @@ def test_the_log_is_read_back_in_windows_and_by_node_rank_and_attempt(visitor: V
     last = log_of(visitor, talking, node="0")
     assert len(last["lines"]) == 400 and last["more"]
     first = log_of(visitor, talking, node="0", before=json.dumps(last["first"]))
-    whole = [each for each in said(first) + said(last) if each.startswith("line ")]
+    whole = [each for each in texts(first) + texts(last) if each.startswith("line ")]
     assert whole == [f"line {i} of 0" for i in range(600)] and not first["more"]
     onwards = log_of(visitor, talking, node="0", after=json.dumps(first["last"]))
-    assert said(onwards)[:400] == said(last)
+    assert texts(onwards)[:400] == texts(last)
     assert {each[2] for each in log_of(visitor, talking)["lines"]} == {0, 1}
     assert log_of(visitor, talking, rank="7")["lines"] == [] and log_of(visitor, talking, attempt="2")["lines"] == []
     for wrong in ({"before": "x"}, {"before": '{"1/0": -1}'}, {"node": "x"}):
@@ -154,7 +154,7 @@ def test_the_stream_has_what_changed_and_ends_with_the_job(visitor: Visitor, tal
 def test_a_page_goes_on_with_the_line_after_the_last_one_that_it_has(visitor: Visitor, talking: str) -> None:
     middle = log_of(visitor, talking, before=json.dumps(log_of(visitor, talking)["first"]))
     had = json.dumps({"i": None, "l": middle["last"]})
-    expected = said(log_of(visitor, talking))
+    expected = texts(log_of(visitor, talking))
     by_header = visitor.events(f"/jobs/{talking}/stream", **{"Last-Event-ID": had})
     by_query = visitor.events(f"/jobs/{talking}/stream?last={had}")
     for events in (by_header, by_query):
@@ -170,12 +170,12 @@ def test_a_page_that_missed_too_much_gets_the_last_lines(console: Console, talki
     events = visitor.events(f'/jobs/{talking}/stream?last={{"i":0,"l":{{}}}}')
     (window,) = [data for name, data, _ in events if name == "window"]
     assert len(window["lines"]) == 400 and window["skipped"] > 2 << 20
-    assert said(window)[-1].startswith("late 19999 ")
+    assert texts(window)[-1].startswith("late 19999 ")
 
 
 def test_the_stream_has_new_iterations_and_tells_what_went_back(visitor: Visitor, training: str, store: Store) -> None:
-    told = visitor.http.get("/runs/taught/curves", params={"name": "reward*"}).json()
-    assert told["series"]["reward"] == [i / 2 for i in range(1, 10)] and told["last"] == 9
+    result = visitor.http.get("/runs/taught/curves", params={"name": "reward*"}).json()
+    assert result["series"]["reward"] == [i / 2 for i in range(1, 10)] and result["last"] == 9
     had = json.dumps({"i": 7, "l": {}})
     metrics = (data for name, data, _ in visitor.events(f"/jobs/{training}/stream?last={had}") if name == "metrics")
     series = {"reward": [4.0, 4.5], "reward_alive": [1.0, 1.0], "action_std": [None, 0.41]}
@@ -220,8 +220,8 @@ def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_said_yes(console
     console.client.batch("TerminateJob", jobId=first, reason="enough")
     await_status(console.client, first, "FAILED")
     visitor = console.visitor()
-    asked = visitor.submit(f"/jobs/{first}/resume", checkpoint="3")
-    assert asked.status_code == 409 and "after iteration 3 no longer counts" in asked.json()["question"]["text"]
+    question = visitor.submit(f"/jobs/{first}/resume", checkpoint="3")
+    assert question.status_code == 409 and "after iteration 3 no longer counts" in question.json()["question"]["text"]
     sent = {"confirmed": "yes", "changes": "train.iterations=30\n\n", "accept_changed_robot": "yes"}
     answer = visitor.submit(f"/jobs/{first}/resume", checkpoint="3", **sent)
     resumed = spec_of(console, answer)["train"]

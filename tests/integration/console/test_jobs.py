@@ -127,11 +127,11 @@ def test_the_stream_has_the_page_first_and_then_only_what_changes(console: Conso
 
 def test_marked_jobs_are_stopped_once_the_person_has_said_yes(console: Console, many: list[str]) -> None:
     visitor = console.visitor()
-    asked = visitor.submit("/jobs/stop", job=many[:2])
-    assert asked.status_code == 409 and asked.json()["question"]["title"] == "Stop 2 jobs?"
+    question = visitor.submit("/jobs/stop", job=many[:2])
+    assert question.status_code == 409 and question.json()["question"]["title"] == "Stop 2 jobs?"
     assert console.client.get(f"/api/jobs/{many[0]}")["status"] == "RUNNABLE"
-    told = visitor.submit("/jobs/stop", job=many[:2], confirmed="yes").json()
-    assert told == {"location": "/", "message": "2 jobs asked to stop"}
+    result = visitor.submit("/jobs/stop", job=many[:2], confirmed="yes").json()
+    assert result == {"location": "/", "message": "2 jobs asked to stop"}
     for job in many[:2]:
         await_status(console.client, job, "FAILED")
     assert console.client.get(f"/api/jobs/{many[0]}")["statusReason"] == "stopped in the console by key admin"
@@ -139,9 +139,9 @@ def test_marked_jobs_are_stopped_once_the_person_has_said_yes(console: Console, 
 
 def test_without_scripts_a_page_asks_and_its_form_goes_on(console: Console, visitor: Visitor, many: list[str]) -> None:
     token = visitor.page("/").form_token
-    asked = visitor.http.post("/jobs/stop", data={"form_token": token, "job": many[2:4], "search": "job-2"})
-    page = Page(asked.text)
-    assert asked.status_code == 409 and "Stop 2 jobs?" in page.text
+    question = visitor.http.post("/jobs/stop", data={"form_token": token, "job": many[2:4], "search": "job-2"})
+    page = Page(question.text)
+    assert question.status_code == 409 and "Stop 2 jobs?" in page.text
     fields: dict[str, list[str]] = {"confirmed": ["yes"]}
     for each in page.all("input", type="hidden"):
         fields.setdefault(str(each["name"]), []).append(str(each["value"]))
@@ -153,8 +153,8 @@ def test_without_scripts_a_page_asks_and_its_form_goes_on(console: Console, visi
 
 def test_all_that_the_filter_finds_is_stopped_also_beyond_the_page(console: Console, many: list[str]) -> None:
     visitor = console.visitor()
-    asked = visitor.submit("/jobs/stop", all="yes", search="job-1")
-    assert asked.json()["question"]["title"] == "Stop 30 jobs?"
+    question = visitor.submit("/jobs/stop", all="yes", search="job-1")
+    assert question.json()["question"]["title"] == "Stop 30 jobs?"
     lab = console.visitor("lab")
     assert "may use job queue lab only" in lab.refusal("/jobs/stop", job=[many[5]], confirmed="yes")
     assert visitor.submit("/jobs/stop", all="yes", search="job-", confirmed="yes").status_code == 200
@@ -181,8 +181,10 @@ def waiting(console: Console) -> dict[str, str]:
     found["shared"] = console.client.batch("SubmitJob", **job)["jobId"]
 
     def has_all() -> Any:
-        told = console.client.get("/api/queues")
-        return {job["id"] for queue in told["queues"] for job in queue["front"]} == {*found.values()} and told["hosts"]
+        result = console.client.get("/api/queues")
+        return {job["id"] for queue in result["queues"] for job in queue["front"]} == {*found.values()} and result[
+            "hosts"
+        ]
 
     wait_for(has_all, 30, "a scheduling pass")
     return found
@@ -206,8 +208,8 @@ def test_why_a_job_waits_is_what_the_api_says(console: Console, waiting: dict[st
     page = console.visitor().page("/queues?queue=shared")
     assert " ".join(reason.split()) in page.text and reason in console.visitor().page("/?queue=shared").text
     assert not rows_of(page, waiting["default"]) and rows_of(page, waiting["shared"])
-    (told,) = console.client.get("/api/queues", queue="shared")["queues"]
-    (front,) = told["front"]
+    (result,) = console.client.get("/api/queues", queue="shared")["queues"]
+    (front,) = result["front"]
     assert (front["id"], front["reason"], front["share"]) == (waiting["shared"], reason, "admin")
 
 
@@ -239,11 +241,11 @@ def test_a_share_in_use_is_told_with_its_weight_and_the_host_as_full(console: Co
     job = {"jobName": "runs", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "admin"}
     running = console.client.batch("SubmitJob", **job)["jobId"]
     await_status(console.client, running, "RUNNING")
-    told = console.client.get("/api/queues", queue="shared")
-    (share,) = told["queues"][0]["shares"]
+    result = console.client.get("/api/queues", queue="shared")
+    (share,) = result["queues"][0]["shares"]
     assert (share["share"], share["weight"], share["inUse"]) == ("admin", 0.5, {"cpus": 1.0, "gpus": 0})
     assert share["score"] == pytest.approx(share["used"] * 0.5)
-    assert told["hosts"][0]["inUse"]["cpus"] == 1.0 and told["queues"][0]["inUse"] == {"cpus": 1.0, "gpus": 0}
+    assert result["hosts"][0]["inUse"]["cpus"] == 1.0 and result["queues"][0]["inUse"] == {"cpus": 1.0, "gpus": 0}
     page = console.visitor().page("/queues")
     assert rows_of(page, "shared/admin") and "1 of 1" in page.text
     console.client.batch("TerminateJob", jobId=running, reason="enough")

@@ -67,8 +67,8 @@ def test_verify_reads_every_file_and_names_the_one_that_was_altered(console: Con
     weights = fast.bundle / "policy.onnx"
     weights.chmod(0o644)
     weights.write_bytes(b"other w")
-    told = visitor.page("/models/fast?verify=yes").text
-    assert "policy.onnx" in told and "Every file is as" not in told
+    result = visitor.page("/models/fast?verify=yes").text
+    assert "policy.onnx" in result and "Every file is as" not in result
     weights.write_bytes(b"weights")
 
 

@@ -126,9 +126,9 @@ def test_the_comparison_is_that_of_the_command(console: Console, store: Store, m
 
 
 def test_curves_over_seeds_have_their_spread(visitor: Visitor, store: Store) -> None:
-    told = visitor.http.get("/compare/curves?run=fast*&run=sure", headers={"Accept": "application/json"}).json()
-    group, single = told["lines"]
-    assert (told["x"][0], told["x"][-1], len(told["x"])) == (100.0, 900.0, 200)
+    result = visitor.http.get("/compare/curves?run=fast*&run=sure", headers={"Accept": "application/json"}).json()
+    group, single = result["lines"]
+    assert (result["x"][0], result["x"][-1], len(result["x"])) == (100.0, 900.0, 200)
     assert group["name"] == "fast* (2)" and group["y"][0] == 11.0 and group["low"][0] == pytest.approx(11 - 2**0.5)
     assert group["high"][-1] == pytest.approx(99 + 9 * 2**0.5) and single["y"][0] == 11.0 and "low" not in single
     empty = visitor.http.get("/compare/curves?run=fast&metric=note", headers={"Accept": "application/json"}).json()

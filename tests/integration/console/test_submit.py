@@ -29,15 +29,15 @@ def test_the_wizard_shows_the_yaml_that_it_submits(console: Console, visitor: Vi
     given = {"worlds": "8", "ppo__gamma": "0.9", "ppo__learning_rate": "3e-4", "sac__tau": "0.1"}
     given = {f"train__{name}": value for name, value in given.items()}
     fields = filled(visitor, "Cartpole", **given, train__config__rewards__alive="0.2", nodes="{min: 1, max: 2}")
-    told = checked(visitor, fields)
-    assert told["problem"] is None and told["help"] is None
-    job, _ = strict_yaml.load(told["yaml"])
+    result = checked(visitor, fields)
+    assert result["problem"] is None and result["help"] is None
+    job, _ = strict_yaml.load(result["yaml"])
     ppo = {"learning_rate": 0.0003, "gamma": 0.9}
     train = {"task": "Cartpole", "worlds": 8, "iterations": 100, "algorithm": "ppo", "ppo": ppo}
     assert job["train"] == {**train, "config": {"rewards": {"alive": 0.2}}}
     assert (job["nodes"], list(job)[:3]) == ({"min": 1, "max": 2}, ["name", "queue", "nodes"])
     review = Page(visitor.http.post("/submit/review", data=fields).text)
-    assert yaml_of(review) == told["yaml"]
+    assert yaml_of(review) == result["yaml"]
     assert "python -P -m worker.train" in review.text and "localhost" in review.text
     answer = visitor.submit("/submit", yaml=yaml_of(review))
     id_ = answer.json()["location"].rpartition("/")[2]
@@ -123,13 +123,13 @@ def test_names_are_text_wherever_they_are_shown(console: Console) -> None:
 def test_any_job_is_submitted_as_yaml_with_help_for_the_line_and_its_errors_marked(console: Console) -> None:
     visitor = console.visitor()
     text = "name: x\nqueue: lab\ntrain:\n  task: Ant\n  worlds: 2\n  wordls: 3\n"
-    told = checked(visitor, {"yaml": text.replace("\n", "\r\n")}, line="4")
-    assert told["yaml"] == text
-    assert (told["problem"]["key"], told["problem"]["line"]) == ("train.wordls", 6)
-    assert "did you mean worlds?" in told["problem"]["message"]
-    keys = {each["name"]: each for each in told["help"]["keys"]}
-    assert told["help"]["section"] == "train" and keys["task"]["present"] and not keys["seed"]["present"]
-    assert "name of a task" in told["help"]["key"]["about"]
+    result = checked(visitor, {"yaml": text.replace("\n", "\r\n")}, line="4")
+    assert result["yaml"] == text
+    assert (result["problem"]["key"], result["problem"]["line"]) == ("train.wordls", 6)
+    assert "did you mean worlds?" in result["problem"]["message"]
+    keys = {each["name"]: each for each in result["help"]["keys"]}
+    assert result["help"]["section"] == "train" and keys["task"]["present"] and not keys["seed"]["present"]
+    assert "name of a task" in result["help"]["key"]["about"]
     answer = visitor.http.post("/submit/review", data={"form_token": visitor.page("/").form_token, "yaml": text})
     assert answer.status_code == 400 and Page(answer.text).all("div", **{"data-line": "6"})
     sent = {"form_token": visitor.page("/").form_token, "yaml": COMMAND}

@@ -90,12 +90,12 @@ class Visitor:
         given = {"Accept": "text/event-stream", **headers}
         with self.http.stream("GET", path, headers=given) as answer:
             assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/event-stream")
-            told: dict[str, str] = {}
+            result: dict[str, str] = {}
             for line in answer.iter_lines():
                 name, _, value = line.partition(": ")
-                if not line and "data" in told:
-                    yield told.get("event", "message"), json.loads(told["data"]), told.get("id", "")
-                told = {**told, name: value} if line else {}
+                if not line and "data" in result:
+                    yield result.get("event", "message"), json.loads(result["data"]), result.get("id", "")
+                result = {**result, name: value} if line else {}
 
     def close(self) -> None:
         self.http.close()
