@@ -1,4 +1,4 @@
-"""What the pages of a job and of a run show of the API's JSON: facts, attempts, checkpoints and evaluations."""
+"""The parts that the pages of a job and of a run have, made of the API's JSON: facts, attempts, checkpoints and evaluations."""
 
 from __future__ import annotations
 
