@@ -2,55 +2,51 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from math import inf
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from orchestrator.cli.jobs import (
+from orchestrator.cli.controllers import check_detached, controller, see_through
+from orchestrator.cli.options import (
+    CpusOption,
+    DatabaseOption,
+    DetachOption,
+    DryRunOption,
+    JsonOption,
+    NameOption,
+    NodesOption,
+    QueueOption,
     SetOption,
     SpecArgument,
+    StoreOption,
     check_engine,
-    on_engine,
-    store_here,
-    submit_spec,
-    tell,
-    tell_note,
 )
-from orchestrator.cli.progress import follow
-from orchestrator.cli.terminal import echo
-from orchestrator.client import Client
+from orchestrator.cli.progress import await_end, follow, outcome
+from orchestrator.cli.submitting import load_spec, note, on_engine, plan_spec, report, store_here, submit_spec
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.control.disk import DEFAULT, MinFree
-from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable, UsageError
+from orchestrator.domain.errors import SpecError, UsageError
 from orchestrator.domain.retention import rule_of
 from orchestrator.engines.toolkit.environment import INHERIT, PRIVATE
-from orchestrator.home import ControllerRuns, local_url, muster_home
-from orchestrator.spec import file as specfile
+from orchestrator.home import muster_home
 from orchestrator.spec.values import seconds_of
 
-StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
-EngineOption = Annotated[
+EnginesOption = Annotated[
     list[str] | None,
     typer.Option(
+        "--engine",
+        metavar="ENGINE",
         help="Engine that runs the nodes: local (the default: processes on this machine), docker (containers of the job's image), ray, "
-        "slurm or aws-batch. Repeatable: the first gets the queue default, each other one a queue that has its name. An engine whose jobs in the "
-        "queue default are not over keeps it."
+        "slurm or aws-batch. Repeatable: the first gets the queue default, each other one a queue that has its name. An engine with "
+        "unfinished jobs in the queue default keeps it.",
     ),
 ]
-_SHORTEST_SILENCE = 10.0
-_SHORTEST_INTERVAL, _LONGEST_INTERVAL = 1.0, 240.0
-"""Seconds between two calls of squeue: slurmctld forgets an ended job after 300 s by default (MinJobAge)."""
-CpusOption = Annotated[
-    float | None, typer.Option(min=0.1, help="CPU cores to allocate; by default all of the machine's.")
-]
-
 InheritOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -62,6 +58,9 @@ InheritOption = Annotated[
         show_envvar=False,
     ),
 ]
+_SHORTEST_SILENCE = 10.0
+_SHORTEST_INTERVAL, _LONGEST_INTERVAL = 1.0, 240.0
+"""Seconds between two calls of squeue: slurmctld forgets an ended job after 300 s by default (MinJobAge)."""
 
 
 def register(app: typer.Typer) -> None:
@@ -72,28 +71,43 @@ def register(app: typer.Typer) -> None:
 def run(
     spec: SpecArgument,
     set_: SetOption = None,
+    name: NameOption = None,
+    queue: QueueOption = None,
+    engine: EnginesOption = None,
+    nodes: NodesOption = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
-    engine: EngineOption = None,
     inherit: InheritOption = None,
+    follow_: DetachOption = True,
+    dry_run: DryRunOption = False,
+    as_json: JsonOption = False,
 ) -> None:
-    """Run a job to its end, with a temporary controller if none is running; exit with its result.
+    """Run a job to its end, with a temporary controller if none is running.
 
-    Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
+    It exits with the job's result. Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
-    loaded = specfile.load(spec, set_, lambda: store_here(store))
-    tell(loaded)
+    loaded = load_spec(spec, set_, name, queue, nodes, lambda: store_here(store))
     have_inherited(inherit)
-    for name in engine or ():
-        check_engine(name)
+    for each in engine or ():
+        check_engine(each)
     with controller(store, cpus, engine or ()) as connect:
         client = connect()
         if inherit and (client.found or os.environ.get("MUSTER_URL")):
-            tell_note(f"--inherit: the controller at {client.url} runs already; its own --inherit says what jobs get")
-        if engine:
-            loaded = on_engine(client, loaded, engine[0], spec)
-        job = submit_spec(client, loaded, spec)["jobId"]
-        code = see_through(client, job)
+            note(f"--inherit: the controller at {client.url} runs already; its own --inherit says what jobs get")
+        loaded = on_engine(client, loaded, engine[0] if engine else None, spec)
+        if dry_run:
+            plan_spec(client, loaded, as_json)
+            return
+        if not follow_:
+            check_detached(client)
+        submitted = submit_spec(client, loaded, spec)
+        job = submitted["jobId"]
+        if not follow_:
+            report(client, submitted, f"submitted {submitted['jobName']} as {job}", False, as_json)
+            return
+        code = see_through(client, job, await_end if as_json else follow)
+        if as_json:
+            echo_json(outcome(client.get(f"/api/jobs/{job}")), indent=1)
     raise typer.Exit(code)
 
 
@@ -111,18 +125,6 @@ def have_inherited(names: Sequence[str] | None) -> None:
     os.environ[INHERIT] = " ".join(names or ())
 
 
-def see_through(client: Client, job: str, follow: Callable[[Client, str], int] = follow) -> int:
-    """Follow a job to its end; Ctrl-C and SIGTERM stop it after a checkpoint. Returns the command's exit code."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        return follow(client, job)
-    except KeyboardInterrupt:
-        echo("\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)", err=True)
-        client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")
-        follow(client, job)
-        return 130
-
-
 def serve(
     host: Annotated[
         str, typer.Option(help="Address to listen on; any but loopback requires a key (muster keys) or MUSTER_TOKEN.")
@@ -133,18 +135,12 @@ def serve(
         bool,
         typer.Option(
             "--adopt-store",
-            help="Take what is at the store's path as the store of this controller, which knows another one.",
+            help="Use the store at this path although the controller knows another one.",
         ),
     ] = False,
     cpus: CpusOption = None,
-    engine: EngineOption = None,
-    database: Annotated[
-        str | None,
-        typer.Option(
-            envvar="MUSTER_DATABASE",
-            help="postgresql+psycopg://USER@HOST/NAME, or path of an SQLite file on a local disk; $MUSTER_HOME/muster.db by default.",
-        ),
-    ] = None,
+    engine: EnginesOption = None,
+    database: DatabaseOption = None,
     retention: Annotated[
         str | None,
         typer.Option(
@@ -223,7 +219,10 @@ def serve(
     ] = None,
     inherit: InheritOption = None,
 ) -> None:
-    """Run the controller as a server. Running jobs outlive it; the next controller finds them."""
+    """Run the controller as a server. Running jobs outlive it.
+
+    The next controller finds them.
+    """
     from orchestrator.server import Server  # imports dependencies of the controller only
     from orchestrator.service_manager import ServiceManager
 
@@ -302,82 +301,6 @@ def _min_free(text: str) -> MinFree:
         return MinFree.parse(text) if text else DEFAULT
     except ValueError as error:
         raise SpecError(f"--min-free {text}: {error}") from None
-
-
-@contextlib.contextmanager
-def controller(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[Callable[[], Client]]:
-    """A function that connects to the controller of this home directory, or starts one if none is running."""
-    with contextlib.ExitStack() as stack:
-
-        def connect() -> Client:
-            client = stack.enter_context(_controller(store, cpus, engines))
-            # a service comes back by itself, with its own options; none of this command's may take its place
-            client.successor = connect if client.is_temporary else None
-            return client
-
-        yield connect
-
-
-@contextlib.contextmanager
-def found_or_own(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[tuple[Client, bool]]:
-    """A client of this home directory's controller, and whether this command started that, since none was running.
-
-    One is started only where there may be runs: with a given store, or in a home directory that a controller had. Raises Unreachable, ServerError.
-    """
-    is_own = not os.environ.get("MUSTER_URL") and local_url() is None
-    if is_own and store is None and not (muster_home() / "muster.db").is_file():
-        Client.connect()  # raises Unreachable, with what to do
-    if is_own and store is not None and not (Path(store).expanduser() / "store.json").is_file():
-        raise ServerError(
-            f"--store {store}: there is no store here (no store.json), so no run; name the store of the run"
-        )
-    with controller(store, cpus, engines) as connect:
-        client = connect()
-        yield client, is_own and not client.found  # else another one was starting
-
-
-@contextlib.contextmanager
-def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -> Iterator[Client]:
-    """A client of the controller that serves this home directory, or of a new one in this process."""
-    url = os.environ.get("MUSTER_URL") or local_url()
-    if url:
-        with contextlib.ExitStack() as stack:
-            try:
-                client = stack.enter_context(Client.connect(serving=True))
-                there = client.get("/api/capacity")["store"]
-            except NotServing:
-                raise
-            except Unreachable:
-                if os.environ.get("MUSTER_URL"):
-                    raise
-            else:
-                if store is not None and str(Path(store).expanduser().absolute()) != there:
-                    raise ServerError(
-                        f"--store {store}: the controller at {url} keeps {there}; leave --store out, or stop it"
-                    )
-                yield client
-                return
-    from orchestrator.server import Server
-
-    try:
-        server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",), temporary=True)
-    except ControllerRuns as error:
-        if local_url() not in (None, url):  # it was starting
-            with _controller(store, cpus, engines) as client:
-                yield client
-            return
-        if url is None:
-            raise
-        raise Unreachable(
-            f"the controller at {url} does not answer: it may be frozen or busy; its jobs run on"
-        ) from error
-    server.start()
-    try:
-        with Client(server.url, server.access.own_token) as client:  # it may require a key that this command lacks
-            client.is_temporary = True
-            yield client
-    finally:
-        server.close()
 
 
 def _retention(text: str | None) -> float | None:

@@ -19,7 +19,7 @@ import httpx
 import pytest
 from rich.table import Table
 
-from orchestrator.cli.show import _gpus
+from orchestrator.cli.job_facts import _gpus
 from orchestrator.cli.terminal import print_cut, print_rows, print_wrapped
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 from tests.support.orchestrator.jobs import FOREVER, refusal, refused
@@ -54,7 +54,7 @@ def test_more_than_any_host_has_is_refused_before_anything_is_registered(shared_
         said = refusal(shared_server, "submit", SPEC, "--set", change)
         assert all(part in said for part in ("cartpole.yaml: resources:", *parts)), said
     said = refusal(shared_server, "submit", SPEC, "--engine", "rya")
-    assert "--engine rya: there is no such engine; did you mean ray?" in said
+    assert "--engine rya: unknown engine; did you mean ray?" in said
 
 
 def test_a_server_that_can_t_start_says_why(shared_server: Serving, tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_a_server_that_can_t_start_says_why(shared_server: Serving, tmp_path: Pa
         refused(["serve", "--port", port], home, 1, f"can't listen on 127.0.0.1:{port}", "--port")
     refused([*serve, "--host", "0.0.0.0"], home, 1, "set MUSTER_TOKEN")
     for option, said in (
-        (["--engine", "rya"], "there is no such engine; did you mean ray?"),
+        (["--engine", "rya"], "unknown engine; did you mean ray?"),
         (["--trust-proxy", "x"], "give the proxy's"),
         (["--min-free", "lots"], "lots: expected a size such as 1GiB, a share such as 5%, or 0"),
     ):
@@ -391,7 +391,7 @@ def test_a_resume_without_a_controller_makes_no_store(tmp_path: Path) -> None:
     missing = tmp_path / "stroe"
     done = call_muster("resume", "ant-1f2e3d4c", "--store", str(missing), home=tmp_path / "home")
     assert done.returncode == 1 and "Traceback" not in done.stderr
-    assert f"--store {missing}: there is no store here" in done.stderr.replace("\n", " ")
+    assert f"--store {missing}: not a store (no store.json)" in done.stderr.replace("\n", " ")
     assert not missing.exists()
 
 
