@@ -7,21 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli import options
 from orchestrator.cli.controllers import found_or_own, see_through
-from orchestrator.cli.options import (
-    AcceptOption,
-    CheckpointArgument,
-    CpusOption,
-    DryRunOption,
-    EngineOption,
-    FollowOption,
-    JsonOption,
-    NodesOption,
-    QueueOption,
-    SetOption,
-    StoreOption,
-    split_reference,
-)
 from orchestrator.cli.progress import await_end, follow
 from orchestrator.cli.runs import chosen
 from orchestrator.cli.submitting import changes_of_run, queue_change, report, show_plan
@@ -41,25 +28,25 @@ def register(app: typer.Typer) -> None:
 
 
 def resume(
-    source: CheckpointArgument,
+    source: options.CheckpointArgument,
     checkpoint: Annotated[int | None, typer.Option(hidden=True)] = None,
-    nodes: NodesOption = None,
-    set_: SetOption = None,
-    accept_changed_robot: AcceptOption = False,
-    queue: QueueOption = None,
-    engine: EngineOption = None,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
-    follow_: FollowOption = False,
-    dry_run: DryRunOption = False,
-    as_json: JsonOption = False,
+    nodes: options.NodesOption = None,
+    set_: options.SetOption = None,
+    accept_changed_robot: options.AcceptOption = False,
+    queue: options.QueueOption = None,
+    engine: options.EngineOption = None,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+    follow_: options.FollowOption = False,
+    dry_run: options.DryRunOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Resume a run from its newest checkpoint, at the next iteration.
 
     Where no controller is running, this command is one until the job ends, as `muster run` is: it shows the progress, and Ctrl-C stops the
     job after a checkpoint. --store and --cpus are for this case.
     """
-    run, reference = split_reference(source)
+    run, reference = options.split_reference(source)
     if reference is not None and checkpoint is not None:
         raise UsageError(f"--checkpoint {checkpoint}: {source} names a checkpoint, too; leave one of them out")
     with found_or_own(store, cpus, [engine] if engine else ()) as (client, is_own):
@@ -87,22 +74,22 @@ def resume(
 
 
 def clone(
-    source: CheckpointArgument,
+    source: options.CheckpointArgument,
     name: Annotated[str, typer.Option("--name", help="Name of the new run and of its job.")],
-    set_: SetOption = None,
-    nodes: NodesOption = None,
-    queue: QueueOption = None,
-    engine: EngineOption = None,
-    follow_: FollowOption = False,
-    dry_run: DryRunOption = False,
-    as_json: JsonOption = False,
+    set_: options.SetOption = None,
+    nodes: options.NodesOption = None,
+    queue: options.QueueOption = None,
+    engine: options.EngineOption = None,
+    follow_: options.FollowOption = False,
+    dry_run: options.DryRunOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Start a new run from only the weights of a checkpoint.
 
     Networks and normalisers are copied. The optimizer, the learning rate, the worlds and the curriculum start over at iteration 0, with
     the settings of RUN and the changes of --set: other rewards, another configuration of the task, another seed.
     """
-    run, checkpoint = split_reference(source)
+    run, checkpoint = options.split_reference(source)
     with Client.connect() as client:
         body = {**_body(client, run, set_, queue, engine, nodes, dry_run), "name": name, "checkpoint": checkpoint}
         cloned = client.post(f"/api/runs/{named(run)}/clone", body, seconds=300, once=not dry_run)

@@ -11,7 +11,7 @@ from pathlib import Path
 from orchestrator.cli.progress import follow
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
-from orchestrator.domain.errors import NotServing, ServerError, Unreachable, UsageError
+from orchestrator.domain.errors import NotServing, ServerError, Unreachable
 from orchestrator.home import ControllerRuns, local_url, muster_home
 
 
@@ -25,12 +25,6 @@ def see_through(client: Client, job: str, follow: Callable[[Client, str], int] =
         client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")
         follow(client, job)
         return 130
-
-
-def check_detached(client: Client) -> None:
-    """Raises UsageError for a controller that ends with this command, and the job's supervision with it."""
-    if client.is_temporary:
-        raise UsageError("--no-follow: no controller is running that would supervise the job; start one: muster serve")
 
 
 @contextlib.contextmanager

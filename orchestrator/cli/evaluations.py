@@ -10,21 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.controllers import check_detached, controller, see_through
-from orchestrator.cli.options import (
-    AcceptOption,
-    CheckpointArgument,
-    CpusOption,
-    DetachOption,
-    DryRunOption,
-    EngineOption,
-    JsonOption,
-    QueueOption,
-    StoreOption,
-    split_reference,
-)
-from orchestrator.cli.progress import await_end, summary
-from orchestrator.cli.submitting import note, plan_spec, queue_change, report, store_of, submit_spec
+from orchestrator.cli import options
+from orchestrator.cli.controllers import controller
+from orchestrator.cli.progress import summary
+from orchestrator.cli.submitting import carry_out, note, queue_change, store_of
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.spec.changes import override
@@ -41,7 +30,7 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate(
-    source: CheckpointArgument,
+    source: options.CheckpointArgument,
     episodes: Annotated[int | None, typer.Option(help="Episodes in all; 100 by default.", show_default=False)] = None,
     worlds: Annotated[
         int | None,
@@ -60,14 +49,14 @@ def evaluate(
         ),
     ] = None,
     name: Annotated[str | None, typer.Option("--name", help="Name of the job; default: evaluate-RUN.")] = None,
-    accept_changed_robot: AcceptOption = False,
-    queue: QueueOption = None,
-    engine: EngineOption = None,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
-    follow: DetachOption = True,
-    dry_run: DryRunOption = False,
-    as_json: JsonOption = False,
+    accept_changed_robot: options.AcceptOption = False,
+    queue: options.QueueOption = None,
+    engine: options.EngineOption = None,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+    follow: options.DetachOption = True,
+    dry_run: options.DryRunOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Evaluate a checkpoint in worlds that its training has not seen.
 
@@ -133,24 +122,15 @@ def follow_evaluation(request: EvaluationRequest, then: Callable[[Path, str], No
     Raises:
         UsageError, SpecError, ApiError, ServerError: One line each.
     """
-    run, checkpoint = split_reference(request.source)
+    run, checkpoint = options.split_reference(request.source)
     section = {key: value for key, value in {"checkpoint": checkpoint, **request.section}.items() if value is not None}
     with controller(request.store, request.cpus) as connect:
         client = connect()
         elsewhere = queue_change(client, request.changes, request.queue, request.engine)
         spec = _spec(client, named(run), request, section, elsewhere)
-        if request.dry_run:
-            plan_spec(client, spec, request.as_json)
-            return 0
-        if not request.follow:
-            check_detached(client)
-        submitted = submit_spec(client, spec, f"evaluate {request.source}")
-        job = submitted["jobId"]
-        if not request.follow:
-            report(client, submitted, f"submitted {submitted['jobName']} as {job}", False, request.as_json)
-            return 0
-        code = see_through(client, job, await_end if request.as_json else _printed)
-        if code == 0 and (request.as_json or then):
+        modes = {"follows": request.follow, "dry_run": request.dry_run, "as_json": request.as_json}
+        code, job = carry_out(client, spec, f"evaluate {request.source}", _printed, **modes)
+        if job and code == 0 and (request.as_json or then):
             found = client.get(f"/api/runs/{named(run)}/evaluations")
             result = next(each for each in found if each.get("job") == job)
             if then:

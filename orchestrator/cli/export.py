@@ -7,15 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli import options
 from orchestrator.cli.controllers import controller, see_through
-from orchestrator.cli.options import (
-    AcceptOption,
-    CheckpointArgument,
-    JsonOption,
-    SetOption,
-    StoreOption,
-    split_reference,
-)
 from orchestrator.cli.progress import await_end, follow
 from orchestrator.cli.resources import show_facts
 from orchestrator.cli.runs import chosen
@@ -38,7 +31,7 @@ def register(app: typer.Typer) -> None:
 
 
 def export(
-    source: CheckpointArgument,
+    source: options.CheckpointArgument,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Copy the bundle to this directory, which must not exist.")
     ] = None,
@@ -46,10 +39,10 @@ def export(
         int, typer.Option(min=0, help="Judge the bundle on at least this many episodes; 0: compare only its actions.")
     ] = 16,
     worlds: Annotated[int, typer.Option(min=1, help="Number of simulated worlds in the comparison.")] = 16,
-    set_: SetOption = None,
-    accept_changed_robot: AcceptOption = False,
-    store: StoreOption = None,
-    as_json: JsonOption = False,
+    set_: options.SetOption = None,
+    accept_changed_robot: options.AcceptOption = False,
+    store: options.StoreOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Export a policy as a bundle for a robot, and check it.
 
@@ -58,7 +51,7 @@ def export(
     """
     if output is not None and output.exists():
         raise UsageError(f"-o {output}: exists already; name a new directory")
-    run, reference = split_reference(source)
+    run, reference = options.split_reference(source)
     with controller(store, None) as connect:
         client = connect()
         checkpoint = chosen(client, run, reference)

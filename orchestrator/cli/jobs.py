@@ -8,19 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.options import (
-    DryRunOption,
-    EngineOption,
-    FollowOption,
-    JobArgument,
-    JobsArgument,
-    JsonOption,
-    NameOption,
-    NodesOption,
-    QueueOption,
-    SetOption,
-    SpecArgument,
-)
+from orchestrator.cli import options
 from orchestrator.cli.progress import outcome
 from orchestrator.cli.submitting import load_spec, on_engine, plan_spec, report, store_here, submit_spec
 from orchestrator.cli.terminal import echo, echo_json, one_line
@@ -49,15 +37,15 @@ def register(app: typer.Typer) -> None:
 
 
 def submit(
-    spec: SpecArgument,
-    set_: SetOption = None,
-    name: NameOption = None,
-    queue: QueueOption = None,
-    engine: EngineOption = None,
-    nodes: NodesOption = None,
-    follow_: FollowOption = False,
-    dry_run: DryRunOption = False,
-    as_json: JsonOption = False,
+    spec: options.SpecArgument,
+    set_: options.SetOption = None,
+    name: options.NameOption = None,
+    queue: options.QueueOption = None,
+    engine: options.EngineOption = None,
+    nodes: options.NodesOption = None,
+    follow_: options.FollowOption = False,
+    dry_run: options.DryRunOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Submit a job to a running controller.
 
@@ -75,10 +63,10 @@ def submit(
 
 
 def stop(
-    jobs: JobsArgument,
+    jobs: options.JobsArgument,
     reason: Annotated[str, typer.Option(help="Reason, kept with the job.")] = "stopped by the user",
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Return only when the jobs have ended.")] = True,
-    as_json: JsonOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Stop jobs: they checkpoint and exit; `muster resume` continues.
 
@@ -176,7 +164,7 @@ def lost_iterations(detail: Mapping[str, Any]) -> str:
     return f"lost: {counted(done - saved, 'iteration')}, those after {saved} until {done}"
 
 
-def checkpoint(job: JobArgument, as_json: JsonOption = False) -> None:
+def checkpoint(job: options.JobArgument, as_json: options.JsonOption = False) -> None:
     """Make a training job save now; return when the checkpoint is durable."""
     with Client.connect() as client:
         response = client.post(f"/api/jobs/{named(job)}/checkpoint", {}, seconds=180)
@@ -188,7 +176,7 @@ def checkpoint(job: JobArgument, as_json: JsonOption = False) -> None:
         raise typer.Exit(1)
 
 
-def stacks(job: JobArgument, as_json: JsonOption = False) -> None:
+def stacks(job: options.JobArgument, as_json: options.JsonOption = False) -> None:
     """Print the Python and native stacks of every rank of a running job.
 
     The stacks go to the job's log too.

@@ -8,16 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli import options
 from orchestrator.cli.controllers import controller
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.options import (
-    CheckpointArgument,
-    JsonOption,
-    ModelArgument,
-    StoreOption,
-    split_model,
-    split_reference,
-)
 from orchestrator.cli.resources import Resource, date, number, show_facts
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import named
@@ -61,16 +54,16 @@ def register(app: typer.Typer) -> None:
 
 
 def register_model(
-    source: CheckpointArgument,
+    source: options.CheckpointArgument,
     name: Annotated[str, typer.Option("--name", help="Name of the model; its versions count up from 1.")],
     again: Annotated[
         bool, typer.Option("--again", help="Register a checkpoint again that the model already has.")
     ] = False,
-    store: StoreOption = None,
-    as_json: JsonOption = False,
+    store: options.StoreOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Register a checkpoint's bundle, made by `muster export`, as the next version of a model."""
-    run, checkpoint = split_reference(source)
+    run, checkpoint = options.split_reference(source)
     with controller(store, None) as connect:
         body = {"name": name, "checkpoint": checkpoint, "again": again}
         found = connect().post(f"/api/runs/{named(run)}/models", body, seconds=300)
@@ -87,7 +80,7 @@ def _return(model: dict[str, Any]) -> str:
     return number(best["mean_return"] if best else model.get("score"))
 
 
-def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = False) -> None:
+def show(model: options.ModelArgument, store: options.StoreOption = None, as_json: options.JsonOption = False) -> None:
     """Show a model's origin, evaluation and bundle."""
     found = _read(model, store)
     if as_json:
@@ -124,13 +117,13 @@ def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = 
 
 
 def diff(
-    model: ModelArgument,
+    model: options.ModelArgument,
     other: Annotated[
         str | None,
         typer.Argument(metavar="NAME[@VERSION]", help="Version to compare with; by default the previous one."),
     ] = None,
-    store: StoreOption = None,
-    as_json: JsonOption = False,
+    store: options.StoreOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """List differences between two versions: contract, settings, programs, weights; exit 1 if anything differs."""
     now = _read(model, store)
@@ -162,7 +155,9 @@ def diff(
         raise typer.Exit(1)
 
 
-def verify(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = False) -> None:
+def verify(
+    model: options.ModelArgument, store: options.StoreOption = None, as_json: options.JsonOption = False
+) -> None:
     """Read every file of a model and check its digest; exit 1 if one was altered, removed or added."""
     found = _read(model, store, verify=True)
     problem = found.get("problem")
@@ -175,12 +170,12 @@ def verify(model: ModelArgument, store: StoreOption = None, as_json: JsonOption 
         raise typer.Exit(1)
 
 
-def _read(reference: str, store: str | None, **options: Any) -> dict[str, Any]:
+def _read(reference: str, store: str | None, **query: Any) -> dict[str, Any]:
     """A model by ``NAME[@VERSION]``. Raises UsageError."""
-    name, version = split_model(reference)
+    name, version = options.split_model(reference)
     with controller(store, None) as connect:
         path = f"/api/models/{named(name)}"
-        found: dict[str, Any] = connect().get(path, seconds=300, version=version, **options)
+        found: dict[str, Any] = connect().get(path, seconds=300, version=version, **query)
     return found
 
 

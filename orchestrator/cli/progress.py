@@ -17,7 +17,6 @@ from orchestrator.client import Client, named
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ApiError, Unreachable
 from orchestrator.domain.job import TERMINAL, WAITING
-from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase, phase_in
 from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.metrics import warnings_of
@@ -158,14 +157,6 @@ def _format(line: dict[str, Any]) -> str:
     return f"[node {line['node']} rank {'-' if line['rank'] is None else line['rank']}] {visible(line['text'], colours=True)}"
 
 
-def _describe(record: dict[str, Any]) -> dict[str, str]:
-    return {
-        "reward": number(record.get("reward")) or "-",
-        "length": (number(record.get("episode_length"), ".1f") or "-") + shown_metrics(record),
-        "rate": number(record.get("steps_per_second"), ",.0f") or "-",
-    }
-
-
 def shown_metrics(record: Mapping[str, Any]) -> str:
     """The metrics that a task shows in the progress, such as ``  progress 83.1 %``."""
     shown = record.get("shown")
@@ -257,6 +248,19 @@ class _Display:
             return ""
         return f"{self._phase} ({time.monotonic() - self._since:.0f} s)"
 
+    def values(self, record: dict[str, Any]) -> str:
+        """An iteration in one line."""
+        iteration = record["iteration"]
+        parts = [
+            f"{iteration}/{self.total}",
+            f"reward {number(record.get('reward')) or '-'}",
+            f"length {number(record.get('episode_length'), '.1f') or '-'}{shown_metrics(record)}",
+            f"steps/s {number(record.get('steps_per_second'), ',.0f') or '-'}",
+            f"ETA {self.eta(record)}" if iteration < self.total else "",
+            f"nodes {self.nodes}",
+        ]
+        return "  ".join(filter(None, parts))
+
     def eta(self, record: dict[str, Any]) -> str:
         """Remaining time at the pace since the first displayed iteration (at first: of that iteration), as h:mm:ss."""
         now, iteration = time.monotonic(), record["iteration"]
@@ -293,15 +297,10 @@ class _Bar(_Display):
     def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
         self.enter(job)
         if record:
-            values = _describe(record)
-            iteration = self.iteration = record["iteration"]
-            left = f"ETA {self.eta(record)}" if iteration < self.total else ""
-            parts = [
-                *(f"{iteration}/{self.total}", f"reward {values['reward']}", f"length {values['length']}"),
-                *(f"{values['rate']} steps/s", left, counted(self.nodes, "node")),
-                *(f"warning: {one_line(each)}" for each in warnings_of(record, self.run)),
-            ]
-            self._progress.update(self._task, completed=iteration, text="  ".join(filter(None, parts)))
+            self.iteration = record["iteration"]
+            warnings = [f"warning: {one_line(each)}" for each in warnings_of(record, self.run)]
+            text = "  ".join([self.values(record), *warnings])
+            self._progress.update(self._task, completed=self.iteration, text=text)
         elif job["status"] not in ("RUNNING", *TERMINAL):
             self._progress.update(self._task, text=f"{job['status']}: {one_line(job['statusReason'] or '')}")
         elif self.doing:
@@ -342,12 +341,7 @@ class _Lines(_Display):
     def _flush(self) -> None:
         if self._latest is None:
             return
-        values, iteration = _describe(self._latest), self._latest["iteration"]
-        left = f"ETA {self.eta(self._latest)}  " if iteration < self.total else ""
-        echo(
-            f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-            f"steps/s {values['rate']}  {left}nodes {self.nodes}"
-        )
+        echo(f"iteration {self.values(self._latest)}")
         for each in warnings_of(self._latest, self.run):
             echo(f"warning: {one_line(each)}")
         self._latest, self._printed = None, time.monotonic()

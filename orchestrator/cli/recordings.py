@@ -13,17 +13,8 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli import options
 from orchestrator.cli.controllers import controller
-from orchestrator.cli.options import (
-    AcceptOption,
-    CpusOption,
-    JsonOption,
-    OutputOption,
-    OverwriteOption,
-    SourceArgument,
-    StoreOption,
-    split_reference,
-)
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.progress import Activity
 from orchestrator.cli.runs import chosen
@@ -42,21 +33,21 @@ def register(app: typer.Typer) -> None:
 
 
 def record(
-    source: SourceArgument = None,
-    output: OutputOption = None,
+    source: options.SourceArgument = None,
+    output: options.OutputOption = None,
     worlds: Annotated[int, typer.Option(min=1, max=16, help="Number of worlds.")] = 4,
     episodes: Annotated[int, typer.Option(min=1, help="Number of episodes of each world.")] = 2,
-    overwrite: OverwriteOption = False,
+    overwrite: options.OverwriteOption = False,
     recover: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE", help="Repair a truncated .mcap.partial into a readable file; nothing is recorded."
         ),
     ] = None,
-    accept_changed_robot: AcceptOption = False,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
-    as_json: JsonOption = False,
+    accept_changed_robot: options.AcceptOption = False,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Record a policy in action as an MCAP file, for ROS 2's tools and viewers.
 
@@ -76,9 +67,9 @@ def record(
         client = connect()
         run, live = source_of(client, source)
         if live is not None:
-            options = ("--worlds", str(worlds), "--episodes", str(episodes), "--output", str(output.absolute()))
+            arguments = ("--worlds", str(worlds), "--episodes", str(episodes), "--output", str(output.absolute()))
             module = "worker.telemetry.live_recording"
-            raise typer.Exit(run_worker(module, run["path"], "--job", live, *options, run=run["path"]))
+            raise typer.Exit(run_worker(module, run["path"], "--job", live, *arguments, run=run["path"]))
         section = Record(
             run=run["run"],
             checkpoint=checkpoint_of(client, run, source),
@@ -90,16 +81,16 @@ def record(
 
 
 def render(
-    source: SourceArgument,
-    output: OutputOption,
+    source: options.SourceArgument,
+    output: options.OutputOption,
     worlds: Annotated[int, typer.Option(min=1, max=16, help="Number of worlds, side by side.")] = 4,
     seconds: Annotated[float, typer.Option(min=0.1, max=600, help="Simulated time.")] = 6.0,
     size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of a frame [px].")] = "640x360",
-    overwrite: OverwriteOption = False,
-    accept_changed_robot: AcceptOption = False,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
-    as_json: JsonOption = False,
+    overwrite: options.OverwriteOption = False,
+    accept_changed_robot: options.AcceptOption = False,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Film a checkpoint's policy in action, or draw six moments of it.
 
@@ -126,7 +117,7 @@ def render(
 
 def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
     """The run of a reference, and the job if that is training now. Raises ApiError, UsageError."""
-    name = split_reference(source)[0]
+    name = options.split_reference(source)[0]
     try:
         return client.get(f"/api/runs/{named(name)}"), None
     except ApiError as error:
@@ -146,7 +137,7 @@ def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
 
 def checkpoint_of(client: Client, run: dict[str, Any], source: str) -> int:
     """The iteration of the referenced checkpoint. Raises UsageError if it does not exist."""
-    iteration: int = chosen(client, run["run"], split_reference(source)[1])["iteration"]
+    iteration: int = chosen(client, run["run"], options.split_reference(source)[1])["iteration"]
     return iteration
 
 

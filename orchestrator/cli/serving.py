@@ -12,23 +12,10 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.controllers import check_detached, controller, see_through
-from orchestrator.cli.options import (
-    CpusOption,
-    DatabaseOption,
-    DetachOption,
-    DryRunOption,
-    JsonOption,
-    NameOption,
-    NodesOption,
-    QueueOption,
-    SetOption,
-    SpecArgument,
-    StoreOption,
-    check_engine,
-)
-from orchestrator.cli.progress import await_end, follow, outcome
-from orchestrator.cli.submitting import load_spec, note, on_engine, plan_spec, report, store_here, submit_spec
+from orchestrator.cli import options
+from orchestrator.cli.controllers import controller
+from orchestrator.cli.progress import outcome
+from orchestrator.cli.submitting import carry_out, load_spec, note, on_engine, store_here
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.domain.errors import SpecError, UsageError
@@ -69,18 +56,18 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    spec: SpecArgument,
-    set_: SetOption = None,
-    name: NameOption = None,
-    queue: QueueOption = None,
+    spec: options.SpecArgument,
+    set_: options.SetOption = None,
+    name: options.NameOption = None,
+    queue: options.QueueOption = None,
     engine: EnginesOption = None,
-    nodes: NodesOption = None,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
+    nodes: options.NodesOption = None,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
     inherit: InheritOption = None,
-    follow_: DetachOption = True,
-    dry_run: DryRunOption = False,
-    as_json: JsonOption = False,
+    follow_: options.DetachOption = True,
+    dry_run: options.DryRunOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Run a job to its end, with a temporary controller if none is running.
 
@@ -89,24 +76,14 @@ def run(
     loaded = load_spec(spec, set_, name, queue, nodes, lambda: store_here(store))
     have_inherited(inherit)
     for each in engine or ():
-        check_engine(each)
+        options.check_engine(each)
     with controller(store, cpus, engine or ()) as connect:
         client = connect()
         if inherit and (client.found or os.environ.get("MUSTER_URL")):
             note(f"--inherit: the controller at {client.url} runs already; its own --inherit says what jobs get")
         loaded = on_engine(client, loaded, engine[0] if engine else None, spec)
-        if dry_run:
-            plan_spec(client, loaded, as_json)
-            return
-        if not follow_:
-            check_detached(client)
-        submitted = submit_spec(client, loaded, spec)
-        job = submitted["jobId"]
-        if not follow_:
-            report(client, submitted, f"submitted {submitted['jobName']} as {job}", False, as_json)
-            return
-        code = see_through(client, job, await_end if as_json else follow)
-        if as_json:
+        code, job = carry_out(client, loaded, spec, follows=follow_, dry_run=dry_run, as_json=as_json)
+        if as_json and job:
             echo_json(outcome(client.get(f"/api/jobs/{job}")), indent=1)
     raise typer.Exit(code)
 
@@ -130,92 +107,71 @@ def serve(
         str, typer.Option(help="Address to listen on; any but loopback requires a key (muster keys) or MUSTER_TOKEN.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0: any free port.")] = 8080,
-    store: StoreOption = None,
+    store: options.StoreOption = None,
     adopt_store: Annotated[
         bool,
-        typer.Option(
-            "--adopt-store",
-            help="Use the store at this path although the controller knows another one.",
-        ),
+        typer.Option("--adopt-store", help="Use the store at this path although the controller knows another one."),
     ] = False,
-    cpus: CpusOption = None,
+    cpus: options.CpusOption = None,
     engine: EnginesOption = None,
-    database: DatabaseOption = None,
+    database: options.DatabaseOption = None,
     retention: Annotated[
         str | None,
         typer.Option(
-            help="Time to keep ended jobs, their logs, and runs that hold nothing else, such as 90d; off: without end. By "
-            "default jobs of the Batch API are kept for 90d, others without end; the tag muster:retention of a queue takes precedence.",
-            show_default=False,
+            help="Time to keep ended jobs, their logs, and runs that hold nothing else, such as 90d; off: without end. By default 90d for "
+            "jobs of the Batch API, without end for others; a queue's tag muster:retention takes precedence."
         ),
     ] = None,
     min_free: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Free space on the volumes of the store and the database below which no gang starts, such as 1GiB or 5%; 0: "
-            "no limit. By default 1GiB, or 5% of a small volume.",
-            show_default=False,
+            help="Free space of store and database below which no gang starts: 1GiB or 5%; 0: no limit. By default 1GiB, or 5% of a "
+            "small volume."
         ),
-    ] = "",
+    ] = None,
     lost_after: Annotated[
         str,
         typer.Option(
-            help="Time after which a node that alone is silent on the bus is lost, such as 5m, while its engine answers and says that "
-            "it runs. The controller waits for nodes that fall silent together, since it may itself be cut off."
+            help="Time after which a node is lost that alone is silent on the bus, such as 5m, while its engine says that it runs. Nodes "
+            "that fall silent together are waited for, since the controller may be cut off."
         ),
     ] = "120s",
     squeue_interval: Annotated[
         str | None,
         typer.Option(
-            help="Time between two calls of squeue by the slurm engine, such as 60s. By default 1s with at most 10 gangs in Slurm's "
-            "queue, and 30s with more.",
-            show_default=False,
+            help="Time between two calls of squeue, such as 60s. By default 1s with at most 10 gangs, else 30s."
         ),
     ] = None,
     rate_limit: Annotated[
-        int,
-        typer.Option(min=0, help="Requests per second of each key, with bursts of twice as many; 0: unlimited."),
+        int, typer.Option(min=0, help="Requests per second of each key, with bursts of twice as many; 0: unlimited.")
     ] = 1000,
     trust_proxy: Annotated[
         list[str] | None,
         typer.Option(
-            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are trusted; repeatable. "
-            "None by default."
+            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are trusted. Repeatable."
         ),
     ] = None,
     submit_rate_limit: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Submissions (SubmitJob, POST /api/jobs) per second of each key (AWS: 50); 0: unlimited."
-        ),
+        int, typer.Option(min=0, help="Submissions per second of each key (AWS: 50); 0: unlimited.")
     ] = 0,
     secrets: Annotated[
         str | None,
         typer.Option(
-            help="Source of the secrets that job definitions name: a JSON file of names and values, or env for the variables "
-            "MUSTER_SECRET_<name>. Jobs that name secrets are refused by default."
+            help="Source of the secrets that jobs name: a JSON file of names and values, or env for variables MUSTER_SECRET_<name>. By "
+            "default such jobs are refused."
         ),
     ] = None,
     webhooks: Annotated[
         str | None,
-        typer.Option(
-            help="Send a message when jobs end: a JSON file of URLs and secrets, which replace those of the database; see `muster "
-            "webhooks --help`. By default the database's."
-        ),
+        typer.Option(help="JSON file of webhooks, which replaces those in the database; see `muster webhooks --help`."),
     ] = None,
     account_id: Annotated[
         str | None,
-        typer.Option(
-            help="AWS account in all ARNs, 12 digits; 000000000000 by default. The first `muster serve` settles it.",
-            show_default=False,
-        ),
+        typer.Option(help="AWS account in all ARNs, 12 digits. The first `muster serve` settles it; default: zeros."),
     ] = None,
     region: Annotated[
         str | None,
-        typer.Option(
-            help="AWS region in all ARNs; us-east-1 by default. The first `muster serve` settles it. Nothing runs there.",
-            show_default=False,
-        ),
+        typer.Option(help="AWS region in all ARNs. The first `muster serve` settles it; default: us-east-1."),
     ] = None,
     inherit: InheritOption = None,
 ) -> None:
@@ -229,7 +185,7 @@ def serve(
     manager = ServiceManager()
     have_inherited(inherit)
     for name in engine or ():
-        check_engine(name)
+        options.check_engine(name)
     server = Server(
         muster_home(),
         host=host,
@@ -296,7 +252,7 @@ def _squeue_interval(text: str | None, engines: Sequence[str]) -> float | None:
     return seconds
 
 
-def _min_free(text: str) -> MinFree:
+def _min_free(text: str | None) -> MinFree:
     try:
         return MinFree.parse(text) if text else DEFAULT
     except ValueError as error:

@@ -12,6 +12,7 @@ from typing import Any
 
 import typer
 
+from orchestrator.cli.controllers import see_through
 from orchestrator.cli.options import changes_of, check_engine
 from orchestrator.cli.progress import await_end, follow
 from orchestrator.cli.resources import Resource
@@ -120,6 +121,43 @@ def report(client: Client, submitted: Mapping[str, Any], line: str, follows: boo
             echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
     if follows:
         raise typer.Exit((await_end if as_json else follow)(client, submitted["jobId"]))
+
+
+def carry_out(
+    client: Client,
+    spec: Spec,
+    source: str,
+    show: Callable[[Client, str], int] = follow,
+    *,
+    follows: bool,
+    dry_run: bool,
+    as_json: bool,
+) -> tuple[int, str]:
+    """Plan a job, submit it, or submit it and follow it to its end.
+
+    Args:
+        client: The controller's.
+        spec: Of the job.
+        source: Its name in errors.
+        show: Follows the job; with ``as_json`` nothing is shown.
+        follows: Whether the end of the job is awaited.
+        dry_run: Whether it is only planned.
+        as_json: Whether JSON is printed.
+
+    Returns:
+        The exit code, and the id of the job whose end was awaited; empty for no job.
+    """
+    if dry_run:
+        plan_spec(client, spec, as_json)
+        return 0, ""
+    if not follows and client.is_temporary:  # it would end with this command
+        raise UsageError("--no-follow: no controller is running that would supervise the job; start one: muster serve")
+    submitted = submit_spec(client, spec, source)
+    job = submitted["jobId"]
+    if not follows:
+        report(client, submitted, f"submitted {submitted['jobName']} as {job}", False, as_json)
+        return 0, ""
+    return see_through(client, job, await_end if as_json else show), job
 
 
 def plan_spec(client: Client, spec: Spec, as_json: bool) -> None:

@@ -398,6 +398,6 @@ def test_a_resume_without_a_controller_makes_no_store(tmp_path: Path) -> None:
 def test_a_run_on_a_controller_that_runs_already_says_that_it_ignores_what_to_inherit(server: Serving) -> None:
     spec = server.home / "job.yaml"
     spec.write_text("name: brief\nresources: {cpus: 0.1, memory: 16MiB}\ncommand: ['true']\n")
-    done = server.muster_process("run", str(spec), "--inherit", "WANDB_API_KEY")
+    done = server.muster("run", str(spec), "--inherit", "WANDB_API_KEY")
     note = f"note: --inherit: the controller at {server.url} runs already; its own --inherit says what jobs get\n"
     assert done.returncode == 0 and note in done.stderr
