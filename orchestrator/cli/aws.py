@@ -13,7 +13,7 @@ import typer
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.options import JsonOption, YesOption
 from orchestrator.cli.resources import Resource
-from orchestrator.cli.terminal import echo, echo_json, print_rows
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import ServerError
 from orchestrator.engines.aws_batch.config import config_path
 from orchestrator.home import muster_home
@@ -22,7 +22,7 @@ from shared_store.contract.error_text import counted
 if TYPE_CHECKING:
     from orchestrator.engines.aws_batch.stack import Stack, StackEvent
 
-_STATUS = Resource({"": lambda row: row[0], " ": lambda row: row[1]}, layout=print_rows)
+_STATUS = Resource({"": lambda row: row[0], " ": lambda row: row[1]}, whole=True)
 NameOption = Annotated[str, typer.Option("--stack-name", metavar="NAME", help="Name of the CloudFormation stack.")]
 RegionOption = Annotated[str | None, typer.Option(help="AWS region; by default that of your AWS configuration.")]
 ProfileOption = Annotated[str | None, typer.Option(help="Profile of your AWS configuration.")]

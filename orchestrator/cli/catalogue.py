@@ -66,8 +66,8 @@ _MODULES = {
     **dict.fromkeys(("list", "show"), "job_facts"),
     **dict.fromkeys(("resume", "clone"), "continuing"),
     **dict.fromkeys(("runs", "checkpoints"), "runs"),
-    **dict.fromkeys(("record", "render"), "recordings"),
-    **{"evaluate": "evaluations", "compare": "comparing", "view": "viewing", "verify-resume": "verify"},
+    **dict.fromkeys(("record", "render", "view"), "recordings"),
+    **{"evaluate": "evaluations", "compare": "comparing", "verify-resume": "verify"},
 }
 """Modules of this package, of commands that have another name than theirs."""
 _LOCAL = frozenset({"serve", "keys", "aws", "tasks", "robot", "schema"})
@@ -163,6 +163,8 @@ def _members(group: TyperInfo) -> Iterator[CommandInfo | TyperInfo]:
 
 def _use_server(ctx: typer.Context, url: str | None) -> str | None:
     if url is not None:
+        if not url.strip():
+            raise UsageError("--server: give the URL of a controller, such as http://127.0.0.1:8080")
         os.environ["MUSTER_URL"] = ctx.meta[_SERVER] = url
     return url
 
@@ -175,7 +177,6 @@ ServerOption = Annotated[
         callback=_use_server,
         is_eager=True,
         help="URL of the controller; default: $MUSTER_URL, else this home directory's. $MUSTER_TOKEN is its key.",
-        show_default=False,
     ),
 ]
 """Every command for a controller has it, before and after its name."""

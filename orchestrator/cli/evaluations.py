@@ -31,7 +31,7 @@ def register(app: typer.Typer) -> None:
 
 def evaluate(
     source: options.CheckpointArgument,
-    episodes: Annotated[int | None, typer.Option(help="Episodes in all; 100 by default.", show_default=False)] = None,
+    episodes: Annotated[int | None, typer.Option(help="Episodes in all; 100 by default.")] = None,
     worlds: Annotated[
         int | None,
         typer.Option(help="Worlds that each rank simulates at once; 1024 by default, at most one for each episode."),

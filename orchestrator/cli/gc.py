@@ -42,7 +42,6 @@ def gc(
         typer.Option(
             metavar="DURATION",
             help="Delete what ended longer ago, such as 30d, in queues without a rule. By default: as `muster serve --retention` says.",
-            show_default=False,
         ),
     ] = None,
     as_json: JsonOption = False,

@@ -14,7 +14,7 @@ from sqlalchemy.exc import ArgumentError
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.options import DatabaseOption, JsonOption
 from orchestrator.cli.resources import Resource, date_ms
-from orchestrator.cli.terminal import echo, echo_json, print_rows
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import EXAMPLE_URL
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError
 from orchestrator.home import ControllerRuns, HomeLock, local_database, local_region, local_url, muster_home
@@ -34,7 +34,7 @@ KEYS = Resource(
         "CREATED": lambda key: date_ms(key.created_at),
     },
     "no keys yet; create one with: muster keys create NAME",
-    layout=print_rows,
+    whole=True,
 )
 
 
@@ -60,8 +60,7 @@ def create(
         str | None,
         typer.Option(
             help="Share identifier of its jobs in queues with a fair-share policy; several keys may have one. By default the letters and "
-            "digits of its name.",
-            show_default=False,
+            "digits of its name."
         ),
     ] = None,
     database: DatabaseOption = None,

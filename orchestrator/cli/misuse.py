@@ -30,6 +30,11 @@ class CommandGroup(TyperGroup):
     otherwise = ""
     """The command for an argument that is no command's name, as in `muster queues default`."""
 
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if self.invoke_without_command and args[:1] == ["--json"] and not "".join(args[1:2]).startswith("-"):
+            args = [*args[1:], "--json"]  # of the command behind it, as in `muster queues --json default`
+        return super().parse_args(ctx, args)
+
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         if self.get_command(ctx, args[0]) is None:
             if self.otherwise and not args[0].startswith("-"):
@@ -65,6 +70,8 @@ def _unless_subcommand(default: Callable[..., None]) -> Callable[..., None]:
     def callback(ctx: typer.Context, **values: Any) -> None:
         if ctx.invoked_subcommand is None:
             default(**values)
+        elif wrong := [name for name, value in values.items() if value]:
+            raise UsageError(f"--{wrong[0]}: an option of {ctx.command_path} alone; leave {ctx.invoked_subcommand} out")
 
     return in_place_of(
         default, callback, inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)

@@ -40,12 +40,8 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the spec: train.iterations=600. Repeatable."),
 ]
-NameOption = Annotated[
-    str | None, typer.Option("--name", help="Name of the job and of its run; default: the spec's.", show_default=False)
-]
-QueueOption = Annotated[
-    str | None, typer.Option("--queue", metavar="QUEUE", help="Job queue; default: the spec's.", show_default=False)
-]
+NameOption = Annotated[str | None, typer.Option("--name", help="Name of the job and of its run; default: the spec's.")]
+QueueOption = Annotated[str | None, typer.Option("--queue", metavar="QUEUE", help="Job queue; default: the spec's.")]
 EngineOption = Annotated[
     str | None,
     typer.Option(
@@ -69,7 +65,7 @@ DryRunOption = Annotated[
         "--dry-run", help="Check the job and show what would start where; --json adds all variables. Nothing starts."
     ),
 ]
-OutputOption = Annotated[Path | None, typer.Option("--output", "-o", help="The file to write.", show_default=False)]
+OutputOption = Annotated[Path | None, typer.Option("--output", "-o", help="The file to write.")]
 OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
 YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 AcceptOption = Annotated[
@@ -95,7 +91,6 @@ DatabaseOption = Annotated[
         envvar="MUSTER_DATABASE",
         metavar="URL|PATH",
         help="postgresql+psycopg://USER@HOST/NAME, or path of an SQLite file on a local disk; $MUSTER_HOME/muster.db by default.",
-        show_default=False,
     ),
 ]
 

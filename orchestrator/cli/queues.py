@@ -10,7 +10,7 @@ from orchestrator.cli.misuse import CommandGroup, make_group
 from orchestrator.cli.options import JsonOption
 from orchestrator.cli.resources import Resource
 from orchestrator.cli.submitting import engine_queue
-from orchestrator.cli.terminal import echo, echo_json, one_line, print_wrapped
+from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError, UsageError
 from orchestrator.domain.reasons import short_id, title
@@ -36,7 +36,7 @@ QUEUES = Resource(
         "IN USE": _in_use,
     },
     "no queue; muster queues create NAME",
-    layout=print_wrapped,
+    folded=("IN USE",),
 )
 _FRONT = Resource(
     {
@@ -47,7 +47,6 @@ _FRONT = Resource(
     },
     "no job waits",
     folded=("WHY IT WAITS",),
-    layout=print_wrapped,
 )
 
 
@@ -97,7 +96,7 @@ def create(
     priority: Annotated[int, typer.Option(help="Jobs of a queue with a higher priority start first.")] = 1,
     like: Annotated[
         str | None,
-        typer.Option(metavar="QUEUE", help="Use the compute environments of this queue.", show_default=False),
+        typer.Option(metavar="QUEUE", help="Use the compute environments of this queue."),
     ] = None,
     engine: Annotated[
         str | None, typer.Option(metavar="ENGINE", help="Use the compute environments of this engine's queue.")

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from orchestrator.cli.options import JsonOption, StoreOption
-from orchestrator.cli.terminal import echo, echo_json, print_cut, visible
+from orchestrator.cli.terminal import echo, echo_json, print_cut, print_rows, print_wrapped, visible
 
 Row = Any
 """A mapping, unless every cell is a function."""
@@ -37,7 +37,7 @@ class Resource:
         title: A line above the table.
         blank: Shown in an empty cell.
         problem: Key of a row that can't be read for why, and words before that.
-        layout: Prints the table: one of :mod:`orchestrator.cli.terminal`.
+        whole: Print each row on a line of its own, whatever the terminal's width.
     """
 
     columns: Mapping[str, Cell]
@@ -48,7 +48,7 @@ class Resource:
     title: str = ""
     blank: str = "-"
     problem: tuple[str, str] = ("problem", "can't be read")
-    layout: Callable[[Table], None] = print_cut
+    whole: bool = False
 
     def table(self, rows: Sequence[Row]) -> Table:
         """The rows as a table. One that lacks what a column needs has its :attr:`problem` in the last column."""
@@ -83,7 +83,8 @@ class Resource:
         elif rows:
             if self.title:
                 echo(f"\n{self.title}")
-            self.layout(self.table(rows))
+            print_table = print_rows if self.whole else print_wrapped if self.folded else print_cut
+            print_table(self.table(rows))
         elif self.empty:
             echo(self.empty)
 

@@ -12,7 +12,7 @@ from orchestrator.cli.options import JsonOption, OverwriteOption
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.resources import Cell, Resource, number
 from orchestrator.cli.tasks import ask_worker
-from orchestrator.cli.terminal import echo, echo_json, print_wrapped
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import SpecError
 from shared_store.contract.error_text import counted
 
@@ -34,33 +34,23 @@ def robot(
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Draw its default pose into this PNG file.", show_default=False),
+        typer.Option("--output", "-o", help="Draw its default pose into this PNG file."),
     ] = None,
     overwrite: OverwriteOption = False,
     fixed: Annotated[
         bool | None,
-        typer.Option(
-            "--fixed/--no-fixed",
-            help="Fix its root to the world, or let it move; else as in the file.",
-            show_default=False,
-        ),
+        typer.Option("--fixed/--no-fixed", help="Fix its root to the world, or let it move; else as in the file."),
     ] = None,
     ignore: Annotated[
         list[str] | None,
         typer.Option(
-            "--ignore",
-            metavar="PATTERN",
-            help="Leave out these bodies and geoms (repeatable); else floor and ground.",
-            show_default=False,
+            "--ignore", metavar="PATTERN", help="Leave out these bodies and geoms (repeatable); else floor and ground."
         ),
     ] = None,
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            "--accept",
-            metavar="PATTERN",
-            help='Accept these differences from the file, "ELEMENT: VALUE" (repeatable).',
-            show_default=False,
+            "--accept", metavar="PATTERN", help='Accept these differences from the file, "ELEMENT: VALUE" (repeatable).'
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -168,4 +158,4 @@ def _print(found: dict[str, Any], compare: bool) -> None:
 def _print_differences(title: str, differences: list[dict[str, str]]) -> None:
     columns = {"ELEMENT": "element", "VALUE": "field", "NEWTON": "here", "FILE": "file"}
     empty = f"\n{title}: nothing; Newton's importer reads the robot that its file says"
-    Resource(columns, empty, title=title, blank="", folded=columns, layout=print_wrapped).show(differences)
+    Resource(columns, empty, title=title, blank="", folded=columns).show(differences)

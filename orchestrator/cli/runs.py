@@ -73,7 +73,7 @@ def register(app: typer.Typer) -> None:
 
 
 def list_runs(
-    search: Annotated[str, typer.Option(help="Part of the name.", show_default=False)] = "",
+    search: Annotated[str, typer.Option(help="Part of the name.")] = "",
     archived: Annotated[bool, typer.Option("--archived", help="List the archived runs instead.")] = False,
     as_json: JsonOption = False,
 ) -> None:

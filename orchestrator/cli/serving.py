@@ -41,7 +41,6 @@ InheritOption = Annotated[
         metavar="NAME",
         envvar=INHERIT,
         help="Variable that jobs get, too, such as WANDB_API_KEY: of this environment (local, slurm), of the node's (ray). Repeatable.",
-        show_default=False,
         show_envvar=False,
     ),
 ]

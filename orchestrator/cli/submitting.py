@@ -16,7 +16,7 @@ from orchestrator.cli.controllers import see_through
 from orchestrator.cli.options import changes_of, check_engine
 from orchestrator.cli.progress import await_end, follow
 from orchestrator.cli.resources import Resource
-from orchestrator.cli.terminal import echo, echo_json, one_line, print_rows
+from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, SpecError, Unavailable, Unreachable, UsageError
 from orchestrator.home import local_url, muster_home
@@ -42,7 +42,7 @@ _NODES = Resource(
         "COMMAND": lambda node: shlex.join(node["command"]),
     },
     folded=("COMMAND",),
-    layout=print_rows,  # to be read once, and in full: a narrow terminal breaks the lines
+    whole=True,  # to be read once, and in full: a narrow terminal breaks the lines
 )
 
 

@@ -13,7 +13,7 @@ import typer
 
 from orchestrator.cli.options import JsonOption
 from orchestrator.cli.resources import Resource
-from orchestrator.cli.terminal import Console, echo, print_wrapped
+from orchestrator.cli.terminal import Console, echo
 from orchestrator.domain.errors import ServerError, SpecError
 
 TASKS = Resource(
@@ -27,13 +27,11 @@ TASKS = Resource(
     },
     problem=("error", "can't be imported"),
     folded=("REWARDS",),
-    layout=print_wrapped,
 )
 NUMBERS = Resource(
     {"": lambda row: row[0], " ": lambda row: ", ".join(f"{value:g}" for value in row[1])},
     folded=(" ",),
     title="NUMBERS of train.config.numbers and train.config.curriculum",
-    layout=print_wrapped,
 )
 
 
@@ -74,7 +72,6 @@ def terms(section: str, rows: Sequence[dict[str, str]]) -> Resource:
         folded=[column for column in columns if column != "name"],
         title=section.upper(),
         blank="",
-        layout=print_wrapped,
     )
 
 

@@ -173,14 +173,6 @@ def test_a_narrow_terminal_cuts_reasons(capsys: pytest.CaptureFixture[str], monk
     assert second == ["4567abcd", "another", "RUNNABLE", "waits"]
 
 
-def test_for_another_program_long_reasons_are_whole_and_no_column_is_lost(capsys: pytest.CaptureFixture[str]) -> None:
-    print_cut(table(("0123abcd", "a-job", "FAILED", "a long story " * 120)))
-    header, row = capsys.readouterr().out.splitlines()
-    assert header == header.rstrip(), "a long row pads no other"
-    assert header.split() == ["JOB", "NAME", "STATUS", "REASON"]
-    assert row.split()[:3] == ["0123abcd", "a-job", "FAILED"] and row.count("story") == 120
-
-
 @pytest.mark.parametrize("printing", [print_cut, print_wrapped, print_rows])
 def test_for_another_program_a_long_row_of_any_table_pads_no_other(
     printing: Callable[[Table], None], capsys: pytest.CaptureFixture[str]

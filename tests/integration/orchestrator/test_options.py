@@ -32,9 +32,12 @@ def test_a_run_is_named_placed_sized_planned_detached_and_printed_as_json(lab: S
     spec = str(lab.home / "job.yaml")
     made = lab.muster("queues", "create", "urgent", "--priority", "7")
     assert made.stdout == "created queue urgent with priority 7; use it with: muster submit SPEC --queue urgent\n"
-    assert (
-        printed(lab, "queues", "urgent")[0]["priority"] == 7 == printed(lab, "queues", "show", "urgent")[0]["priority"]
-    )
+    for arguments in (
+        ("queues", "urgent", "--json"),
+        ("queues", "show", "urgent", "--json"),
+        ("queues", "--json", "urgent"),
+    ):
+        assert json.loads(lab.muster(*arguments).stdout)[0]["priority"] == 7
     options = ("--name", "placed", "--queue", "urgent", "--nodes", "2")
     planned = printed(lab, "run", spec, *options, "--dry-run")
     assert len(planned["nodes"]) == 2 and planned["registerJobDefinition"]["jobDefinitionName"] == "placed"
