@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from orchestrator.cli.command_options import JsonOption, YesOption
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.options import JsonOption, YesOption
-from orchestrator.cli.resources import Resource
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import ServerError
 from orchestrator.engines.aws_batch.config import config_path

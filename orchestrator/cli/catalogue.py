@@ -63,7 +63,7 @@ _LISTED = {
 _MODULES = {
     **dict.fromkeys(("run", "serve"), "serving"),
     **dict.fromkeys(("submit", "stop", "stacks", "checkpoint", "schema"), "jobs"),
-    **dict.fromkeys(("list", "show"), "job_facts"),
+    **dict.fromkeys(("list", "show"), "shown_jobs"),
     **dict.fromkeys(("resume", "clone"), "continuing"),
     **dict.fromkeys(("runs", "checkpoints"), "runs"),
     **dict.fromkeys(("record", "render", "view"), "recordings"),

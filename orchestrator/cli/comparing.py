@@ -9,10 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli.command_options import JsonOption, OverwriteOption
 from orchestrator.cli.comparison.curves import ENDINGS, draw
-from orchestrator.cli.options import JsonOption, OverwriteOption
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.outputs import check_output
-from orchestrator.cli.resources import Resource
 from orchestrator.cli.runs import all_runs
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli import options
+from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import found_or_own, see_through
 from orchestrator.cli.progress import await_end, follow
 from orchestrator.cli.runs import chosen

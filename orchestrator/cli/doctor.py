@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from orchestrator.cli.options import JsonOption, StoreOption
+from orchestrator.cli.command_options import JsonOption, StoreOption
 from orchestrator.cli.terminal import Console, echo_json
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError, Unreachable

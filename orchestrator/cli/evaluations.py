@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli import options
+from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import controller
 from orchestrator.cli.progress import summary
 from orchestrator.cli.submitting import carry_out, note, queue_change, store_of

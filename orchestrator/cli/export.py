@@ -7,10 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli import options
+from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import controller, see_through
+from orchestrator.cli.listings import show_facts
 from orchestrator.cli.progress import await_end, follow
-from orchestrator.cli.resources import show_facts
 from orchestrator.cli.runs import chosen
 from orchestrator.cli.submitting import submit_spec
 from orchestrator.cli.terminal import echo, echo_json

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.options import JsonOption
-from orchestrator.cli.resources import Resource, mebibytes
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource, mebibytes
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client
 from shared_store.contract.error_text import counted

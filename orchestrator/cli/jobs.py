@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli import options
+from orchestrator.cli import command_options as options
 from orchestrator.cli.progress import outcome
 from orchestrator.cli.submitting import load_spec, on_engine, plan_spec, report, store_here, submit_spec
 from orchestrator.cli.terminal import echo, echo_json, one_line

@@ -11,9 +11,9 @@ import typer
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
+from orchestrator.cli.command_options import DatabaseOption, JsonOption
+from orchestrator.cli.listings import Resource, date_ms
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.options import DatabaseOption, JsonOption
-from orchestrator.cli.resources import Resource, date_ms
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import EXAMPLE_URL
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.options import JobArgument, JsonOption, SinceOption, seconds_since
+from orchestrator.cli.command_options import JobArgument, JsonOption, SinceOption, seconds_since
 from orchestrator.cli.progress import Waits
 from orchestrator.cli.terminal import echo, echo_raw, to_json, visible
 from orchestrator.client import Client, named

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli import options
+from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import controller
+from orchestrator.cli.listings import Resource, date, number, show_facts
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.resources import Resource, date, number, show_facts
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import named
 from orchestrator.domain.errors import UsageError

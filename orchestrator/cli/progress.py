@@ -11,7 +11,7 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 from rich.text import Text
 
-from orchestrator.cli.resources import duration, number, show_facts
+from orchestrator.cli.listings import duration, number, show_facts
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client, named
 from orchestrator.domain import reasons

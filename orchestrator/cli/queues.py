@@ -6,9 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.misuse import CommandGroup, make_group
-from orchestrator.cli.options import JsonOption
-from orchestrator.cli.resources import Resource
 from orchestrator.cli.submitting import engine_queue
 from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli import options
+from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import controller
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.progress import Activity

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.options import JsonOption, OverwriteOption
+from orchestrator.cli.command_options import JsonOption, OverwriteOption
+from orchestrator.cli.listings import Cell, Resource, number
 from orchestrator.cli.outputs import check_output
-from orchestrator.cli.resources import Cell, Resource, number
 from orchestrator.cli.tasks import ask_worker
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import SpecError

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli.command_options import JsonOption, RunArgument, YesOption
+from orchestrator.cli.listings import Resource, date, date_ms, mebibytes, number, scored
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.options import JsonOption, RunArgument, YesOption
-from orchestrator.cli.resources import Resource, date, date_ms, mebibytes, number, scored
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError

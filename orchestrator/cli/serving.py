@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli import options
+from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import controller
 from orchestrator.cli.progress import outcome
 from orchestrator.cli.submitting import carry_out, load_spec, note, on_engine, store_here

@@ -12,10 +12,10 @@ from typing import Any
 
 import typer
 
+from orchestrator.cli.command_options import changes_of, check_engine
 from orchestrator.cli.controllers import see_through
-from orchestrator.cli.options import changes_of, check_engine
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.progress import await_end, follow
-from orchestrator.cli.resources import Resource
 from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, SpecError, Unavailable, Unreachable, UsageError

@@ -11,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.options import JsonOption
-from orchestrator.cli.resources import Resource
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.terminal import Console, echo
 from orchestrator.domain.errors import ServerError, SpecError
 

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli.command_options import CpusOption, SetOption, SpecArgument, StoreOption
 from orchestrator.cli.controllers import controller, see_through
-from orchestrator.cli.options import CpusOption, SetOption, SpecArgument, StoreOption
 from orchestrator.cli.submitting import load_spec, store_here, submit_spec
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client

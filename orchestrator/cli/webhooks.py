@@ -7,9 +7,9 @@ from typing import Annotated, Any
 
 import typer
 
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.options import JsonOption
-from orchestrator.cli.resources import Resource
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from shared_store.contract.error_text import counted

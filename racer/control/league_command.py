@@ -11,9 +11,16 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from orchestrator.cli.command_options import (
+    CpusOption,
+    JsonOption,
+    ModelArgument,
+    OverwriteOption,
+    StoreOption,
+    split_model,
+)
 from orchestrator.cli.controllers import controller, see_through
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.options import CpusOption, JsonOption, ModelArgument, OverwriteOption, StoreOption, split_model
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.progress import summary
 from orchestrator.cli.terminal import echo, echo_json, print_cut

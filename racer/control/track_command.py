@@ -10,9 +10,9 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
+from orchestrator.cli.command_options import JsonOption, OverwriteOption, StoreOption
 from orchestrator.cli.controllers import controller
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.options import JsonOption, OverwriteOption, StoreOption
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.domain.errors import ServerError, UsageError

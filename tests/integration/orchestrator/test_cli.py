@@ -19,7 +19,7 @@ import httpx
 import pytest
 from rich.table import Table
 
-from orchestrator.cli.job_facts import _gpus
+from orchestrator.cli.shown_jobs import _gpus
 from orchestrator.cli.terminal import print_cut, print_rows, print_wrapped
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 from tests.support.orchestrator.jobs import FOREVER, refusal, refused

@@ -15,7 +15,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from orchestrator.cli.options import JsonOption, StoreOption
+from orchestrator.cli.command_options import JsonOption, StoreOption
 from orchestrator.cli.terminal import echo, echo_json, print_cut, print_rows, print_wrapped, visible
 
 Row = Any

@@ -12,10 +12,10 @@ from typing import Annotated, Any
 import typer
 from rich.text import Text
 
+from orchestrator.cli.command_options import JobArgument, JsonOption, SinceOption, seconds_since
 from orchestrator.cli.jobs import owner_of
-from orchestrator.cli.options import JobArgument, JsonOption, SinceOption, seconds_since
+from orchestrator.cli.listings import Resource, date_ms, duration, number, scored, show_facts
 from orchestrator.cli.progress import describe_best, shown_metrics
-from orchestrator.cli.resources import Resource, date_ms, duration, number, scored, show_facts
 from orchestrator.cli.terminal import Console, echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError
