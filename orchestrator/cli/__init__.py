@@ -10,7 +10,7 @@ import sys
 
 import typer
 
-from orchestrator.cli.misuse import Misuse, told
+from orchestrator.cli.misuse import Misuse, describe
 from orchestrator.cli.terminal import echo, log_visibly, one_line
 from orchestrator.domain.errors import ApiError, NoUrl, ServerError, SpecError, Unreachable, UsageError
 from shared_store import __version__
@@ -18,37 +18,35 @@ from shared_store.contract.plugins import PluginError, plugins
 from shared_store.volume.layout import StoreError
 
 try:
-    from orchestrator.cli.catalogue import ENTRIES, Catalogue, add_placeholders
-except PluginError as error:  # before there is any command
+    from orchestrator.cli.catalogue import ENTRIES, Catalogue, ServerOption, add_placeholders
+except PluginError as error:  # before any command exists
     sys.exit(f"muster: {one_line(str(error))}")
 
 app = typer.Typer(
     name="muster",
     cls=Catalogue,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     help="Runs one robot-learning job on many machines as if they were one.",
-    epilog="Start with:  muster run job_specs/cartpole.yaml",
+    epilog="Start with:  muster run job_specs/cartpole.yaml\nComplete commands with the Tab key:  muster --install-completion",
 )
 add_placeholders(app)
 
-_ADDED = [[command.name] for plugin in plugins().values() for command in plugin.commands]
-"""The commands of plug-ins, whose routes a controller may lack."""
 _NO_ROUTE = (
-    "the controller has no such plug-in: install its package where the controller runs, and start the controller again"
+    "the controller lacks this plug-in: install its package where the controller runs, and restart the controller"
 )
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(shows: bool) -> None:
+    if shows:
         echo(f"muster {__version__}")
         raise typer.Exit
 
 
 @app.callback()
 def _options(
+    server: ServerOption = None,
     version: bool = typer.Option(
         False, "--version", callback=_version, is_eager=True, help="Print the version and exit."
     ),
@@ -63,7 +61,7 @@ def main() -> None:
     try:
         sys.exit(app(prog_name="muster", standalone_mode=False) or 0)
     except Misuse as error:
-        if words := told(error, [entry.name for entry in ENTRIES]):
+        if words := describe(error, [entry.name for entry in ENTRIES]):
             echo(f"muster: {one_line(words)}", err=True)
         sys.exit(2)
     except typer.Abort:
@@ -72,7 +70,8 @@ def main() -> None:
     except (SpecError, UsageError, NoUrl) as error:
         _fail(error, 2)
     except ApiError as error:
-        if error.status == 404 and str(error).endswith(": Not Found") and sys.argv[1:2] in _ADDED:
+        of_plugins = {command.name for plugin in plugins().values() for command in plugin.commands}
+        if error.status == 404 and str(error).endswith(": Not Found") and of_plugins.intersection(sys.argv[1:]):
             error = ApiError(f"{error}; {_NO_ROUTE}", 404)
         _fail(error, 2 if error.status in (400, 404) else 1)
     except (Unreachable, ServerError, StoreError, PluginError) as error:

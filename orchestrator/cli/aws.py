@@ -9,12 +9,11 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.command_options import JsonOption, YesOption
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.terminal import echo, echo_json, print_rows
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import ServerError
 from orchestrator.engines.aws_batch.config import config_path
 from orchestrator.home import muster_home
@@ -23,15 +22,15 @@ from shared_store.contract.error_text import counted
 if TYPE_CHECKING:
     from orchestrator.engines.aws_batch.stack import Stack, StackEvent
 
-NameOption = Annotated[str, typer.Option("--stack-name", help="Name of the CloudFormation stack.")]
+_STATUS = Resource({"": lambda row: row[0], " ": lambda row: row[1]}, whole=True)
+NameOption = Annotated[str, typer.Option("--stack-name", metavar="NAME", help="Name of the CloudFormation stack.")]
 RegionOption = Annotated[str | None, typer.Option(help="AWS region; by default that of your AWS configuration.")]
 ProfileOption = Annotated[str | None, typer.Option(help="Profile of your AWS configuration.")]
-YesOption = Annotated[bool, typer.Option("--yes", "-y", help="Do not ask.")]
 
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Manage the CloudFormation stack for jobs on AWS (network, volume, images, AWS Batch).",
+        "Manage the CloudFormation stack for jobs on AWS.\n\nIt has the network, the volume, the images and AWS Batch.",
         "Examples:  muster aws up --region eu-west-1   then   muster serve --engine aws-batch",
     )
     group.command(epilog="Example:  muster aws up --region eu-west-1 --parameter InstanceTypes=g6.4xlarge")(up)
@@ -46,16 +45,16 @@ def up(
     profile: ProfileOption = None,
     parameter: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=VALUE of a template parameter; repeatable. Other parameters keep their values."),
+        typer.Option(metavar="NAME=VALUE", help="A parameter of the template; repeatable. Others keep their values."),
     ] = None,
     template: Annotated[Path | None, typer.Option(help="A template to use instead of Muster's own.")] = None,
     yes: YesOption = False,
 ) -> None:
     """Create or update the stack, and write $MUSTER_HOME/aws.json for the aws-batch engine."""
-    given = dict(_pair(each) for each in parameter or [])
+    parameters = dict(_pair(each) for each in parameter or [])
     from_template, stack = _stack_module(), _stack(stack_name, region, profile)
     text = from_template.template_text(template)
-    stack.parameters(text, given, existing=False)  # refuse mistakes before the first question
+    stack.parameters(text, parameters, existing=False)  # refuse mistakes before the first question
     if not yes:
         verb = "update" if stack.describe() else "create"
         typer.confirm(
@@ -64,7 +63,7 @@ def up(
             abort=True,
         )
     began = time.time() - 1
-    made = stack.create(text, given)
+    made = stack.create(text, parameters)
     if made is None:
         echo(f"stack {stack_name} is up to date")
     else:
@@ -97,7 +96,7 @@ def down(
     from_template, stack = _stack_module(), _stack(stack_name, region, profile)
     outputs = stack.outputs()
     volume = outputs.get("FileSystemId")
-    stays = f"file system {volume}, with all runs and checkpoints, stays" if volume else "there is no volume yet"
+    stays = f"file system {volume}, with all runs and checkpoints, stays" if volume else "it has no volume yet"
     if not yes:
         jobs = stack.jobs(outputs["JobQueueArn"]) if "JobQueueArn" in outputs else {}
         ended = (
@@ -129,27 +128,23 @@ def status(
 ) -> None:
     """Show the stack: its status, queue, compute environment, jobs and image."""
     stack = _stack(stack_name, region, profile)
-    told = stack.status()
+    found = stack.status()
     if write:
         path = _stack_module().write_config(muster_home(), stack, os.environ.get("AWS_ENDPOINT_URL"))
         echo(f"wrote {path}", err=as_json)
     if as_json:
-        echo_json(told, indent=1)
+        echo_json(found, indent=1)
         return
-    table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_row("stack", f"{stack_name} in {told['region']}: {told['status']} {told['reason']}".strip())
+    rows = {"stack": f"{stack_name} in {found['region']}: {found['status']} {found['reason']}".strip()}
     for key, label in (("computeEnvironment", "compute environment"), ("queue", "queue")):
-        words = told.get(key) or {}
-        text = f"{words.get('state', '')} {words.get('status', '')} {words.get('statusReason', '')}".strip()
-        table.add_row(label, escape(text) or "not there")
-    jobs = ", ".join(f"{count} {state}" for state, count in (told.get("jobs") or {}).items())
-    table.add_row("jobs", jobs or "none wait or run")
-    table.add_row(
-        "image", f"pushed {told['image']}" if told.get("image") else "not pushed yet: see containers/aws/README.md"
-    )
-    for name, value in told["outputs"].items():
-        table.add_row(name, escape(str(value)))
-    print_rows(table)
+        words = found.get(key) or {}
+        states = f"{words.get('state', '')} {words.get('status', '')} {words.get('statusReason', '')}".strip()
+        rows[label] = states or "missing"
+    rows["jobs"] = ", ".join(f"{count} {state}" for state, count in (found.get("jobs") or {}).items()) or "none"
+    image = found.get("image")
+    rows["image"] = f"pushed {image}" if image else "not pushed yet: see containers/aws/README.md"
+    rows |= {name: str(value) for name, value in found["outputs"].items()}
+    _STATUS.show([*rows.items()])
 
 
 def _follow(stack: Stack, made: str, began: float) -> list[StackEvent]:

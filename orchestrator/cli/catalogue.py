@@ -3,117 +3,86 @@
 from __future__ import annotations
 
 import inspect
-import re
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
-from typing import Any
+from typing import Annotated, Any
 
 import typer
-from typer.models import CommandInfo
+from typer.models import CommandInfo, TyperInfo
 
-from orchestrator.cli.misuse import CommandGroup
+from orchestrator.cli.help import print_help, set_forms
+from orchestrator.cli.misuse import CommandGroup, in_place_of
+from orchestrator.domain.errors import UsageError
 from shared_store.contract.error_text import nearest
 from shared_store.contract.plugins import Command, PluginError, blamed, plugins
 from shared_store.contract.plugins import load as load_part
 
-
-def _own(name: str, module: str, panel: str, summary: str) -> Command:
-    """A command of Muster; ``module``: in ``orchestrator.cli``."""
-    return Command(name, f"orchestrator.cli.{module}", panel, summary)
-
-
-_JOBS, _RUNS, _SHARED, _HERE = "Jobs", "Runs", "Controller", "This machine"
-_OWN = (
-    _own(
-        "run",
-        "serving",
-        _JOBS,
-        "Run a job to its end, with a temporary controller if none is running; exit with its result.",
-    ),
-    _own("submit", "jobs", _JOBS, "Submit a job to a running controller."),
-    _own("list", "listing", _JOBS, "List jobs, the newest first."),
-    _own("show", "show", _JOBS, "Show a job: its state and the reason, its attempts and nodes, its run and results."),
-    _own("logs", "logs", _JOBS, "Print a job's log, all nodes and attempts merged by time."),
-    _own("stop", "jobs", _JOBS, "Stop a job: it checkpoints and exits; `muster resume` continues from there."),
-    _own("stacks", "jobs", _JOBS, "Print the Python and native stacks of every rank of a running job."),
-    _own("runs", "stored_runs", _RUNS, "List, archive and delete the runs of the store."),
-    _own("resume", "runs", _RUNS, "Resume a run from its newest checkpoint, at the next iteration."),
-    _own("clone", "clones", _RUNS, "Start a new run from only the weights of a checkpoint."),
-    _own(
-        "evaluate",
-        "evaluations",
-        _RUNS,
-        "Evaluate a checkpoint: whole episodes in worlds that its training has not seen.",
-    ),
-    _own(
-        "compare",
-        "comparing",
-        _RUNS,
-        "Compare runs, or groups of runs that differ only in their seed; draw their curves.",
-    ),
-    _own(
-        "export",
-        "export",
-        _RUNS,
-        "Export a policy as a bundle for a robot (ONNX, contract, self-test), checked against the policy.",
-    ),
-    _own(
-        "models",
-        "models",
-        _RUNS,
-        "Manage exported policies: register, list, show, diff, verify. Versions are immutable.",
-    ),
-    _own("checkpoint", "jobs", _RUNS, "Make a training job save now; return when the checkpoint is durable."),
-    _own("checkpoints", "runs", _RUNS, "List a run's checkpoints; with --verify, exit 1 if one is damaged."),
-    _own("record", "recordings", _RUNS, "Record a policy in action as an MCAP file, for ROS 2's tools and viewers."),
-    _own(
-        "render", "recordings", _RUNS, "Film a checkpoint's policy in action, or show six moments of it in a picture."
-    ),
-    _own("view", "viewing", _RUNS, "View a running training, a checkpoint's policy or a recording in a browser."),
-    _own(
-        "verify-resume",
-        "verify",
-        _RUNS,
-        "Prove that a training survives a crash: train twice, kill one, compare the results bit by bit.",
-    ),
-    _own(
-        "serve",
-        "serving",
-        _SHARED,
-        "Run the controller as a server. Running jobs outlive it; the next controller finds them.",
-    ),
-    _own(
-        "queues",
-        "queues",
-        _SHARED,
-        "List job queues, or one queue's waiting jobs in the order in which they will start.",
-    ),
-    _own("gc", "gc", _SHARED, "Delete old jobs, their logs and their runs, where nothing needs them any more."),
-    _own("keys", "keys", _SHARED, "Manage the access keys of this home directory's server."),
-    _own("webhooks", "webhooks", _SHARED, "List and test the controller's webhooks, which report the end of jobs."),
-    _own(
-        "aws", "aws", _SHARED, "Manage the CloudFormation stack for jobs on AWS (network, volume, images, AWS Batch)."
-    ),
-    _own(
-        "tasks",
-        "tasks",
-        _HERE,
-        "List the installed tasks, or all terms and numbers of one task.",
-    ),
-    _own("robot", "robot", _HERE, "Show a robot's file as a task would load it, beside MuJoCo's own reading."),
-    _own("schema", "jobs", _HERE, "Print the JSON Schema of the job YAML, for editors, or of the policy contract."),
-    _own(
-        "doctor",
-        "doctor",
-        _HERE,
-        "Check whether this machine meets Muster's requirements; exit 1 if a requested part is missing.",
-    ),
+_LISTED = {
+    "Jobs": """
+        run            Run a job to its end, with a temporary controller if none is running.
+        submit         Submit a job to a running controller.
+        list           List jobs, the newest first.
+        show           Show a job: why it is in its state, its attempts and nodes, its results.
+        logs           Print a job's log, all nodes and attempts merged by time.
+        stop           Stop jobs: they checkpoint and exit; `muster resume` continues.
+        stacks         Print the Python and native stacks of every rank of a running job.
+    """,
+    "Runs": """
+        runs           List, archive and delete the runs of the store.
+        resume         Resume a run from its newest checkpoint, at the next iteration.
+        clone          Start a new run from only the weights of a checkpoint.
+        evaluate       Evaluate a checkpoint in worlds that its training has not seen.
+        compare        Compare runs, or groups of runs that differ only in their seed.
+        export         Export a policy as a bundle for a robot, and check it.
+        models         Register, list, show, compare and verify exported policies.
+        checkpoint     Make a training job save now; return when the checkpoint is durable.
+        checkpoints    List a run's checkpoints; with --verify, exit 1 if one is damaged.
+        record         Record a policy in action as an MCAP file, for ROS 2's tools and viewers.
+        render         Film a checkpoint's policy in action, or draw six moments of it.
+        view           View a training, a checkpoint's policy or a recording in a browser.
+        verify-resume  Prove bit by bit that a training survives a crash.
+    """,
+    "Controller": """
+        serve          Run the controller as a server. Running jobs outlive it.
+        queues         List and create job queues, or show which of a queue's jobs start next.
+        gc             Delete old jobs, their logs and their runs, where nothing needs them.
+        keys           Manage the access keys of this home directory's server.
+        webhooks       List and test the webhooks that report the end of jobs.
+        aws            Manage the CloudFormation stack for jobs on AWS.
+    """,
+    "This machine": """
+        tasks          List the installed tasks, or all terms and numbers of one task.
+        robot          Show a robot's file as a task would load it, beside MuJoCo's own reading.
+        schema         Print the JSON Schema of the job YAML, or of the policy contract.
+        doctor         Check whether this machine meets Muster's requirements.
+    """,
+}
+_MODULES = {
+    **dict.fromkeys(("run", "serve"), "serving"),
+    **dict.fromkeys(("submit", "stop", "stacks", "checkpoint", "schema"), "jobs"),
+    **dict.fromkeys(("list", "show"), "shown_jobs"),
+    **dict.fromkeys(("resume", "clone"), "continuing"),
+    **dict.fromkeys(("runs", "checkpoints"), "runs"),
+    **dict.fromkeys(("record", "render", "view"), "recordings"),
+    **{"evaluate": "evaluations", "compare": "comparing", "verify-resume": "verify"},
+}
+"""Modules of this package, of commands that have another name than theirs."""
+_LOCAL = frozenset({"serve", "keys", "aws", "tasks", "robot", "schema"})
+"""Commands that speak to no controller."""
+_SERVER = "muster.server"
+"""Key of a parser's context for the URL of `--server`."""
+_OWN = tuple(
+    Command(name, f"orchestrator.cli.{_MODULES.get(name, name)}", panel, summary)
+    for panel, text in _LISTED.items()
+    for name, summary in (line.split(maxsplit=1) for line in text.strip().splitlines())
 )
 
 
 def _added() -> Iterator[Command]:
-    """The commands of plug-ins. Raises PluginError: one takes the name of Muster's, or adds options to a command that is not there."""
+    """The commands of plug-ins. Raises PluginError: one has the name of Muster's, or adds options to an unknown command."""
     own = [entry.name for entry in _OWN]
     for name, plugin in plugins().items():
         for command in plugin.commands:
@@ -123,7 +92,7 @@ def _added() -> Iterator[Command]:
                 )
         for extended, _ in plugin.options:
             if extended not in own:
-                raise PluginError(f"plug-in {name}: options: there is no command {extended}; {nearest(extended, own)}")
+                raise PluginError(f"plug-in {name}: options: unknown command {extended}; {nearest(extended, own)}")
         yield from plugin.commands
 
 
@@ -147,26 +116,20 @@ class FurtherOptions:
         """Add the options to a command. Raises ValueError where the command has one of this name."""
         own, function = command.callback, self.function
         assert own is not None
-        first, second = (inspect.signature(each, eval_str=True) for each in (own, function))
-        added = [each for each in second.parameters.values() if each.kind is inspect.Parameter.KEYWORD_ONLY]
+        parameters = inspect.signature(function, eval_str=True).parameters.values()
+        added = [each for each in parameters if each.kind is inspect.Parameter.KEYWORD_ONLY]
 
-        def both(**given: Any) -> Any:
-            further = {each.name: given.pop(each.name) for each in added}
-            return function(own, given, **further)
+        def both(**values: Any) -> Any:
+            further = {each.name: values.pop(each.name) for each in added}
+            return function(own, values, **further)
 
-        both.__name__, both.__doc__, both.__annotations__ = own.__name__, own.__doc__, {}
-        both.__signature__ = first.replace(parameters=[*first.parameters.values(), *added])  # type: ignore[attr-defined]
-        command.callback, command.epilog = both, f"{command.epilog}\n{self.examples}"
-
-
-_LINE_END = re.compile(r"(?<!\n)\n(?!\n)")
-"""Marks a line that is not the last of its paragraph."""
-_MODULES = {entry.name: entry.module for entry in ENTRIES}
+        command.callback, command.epilog = in_place_of(own, both, *added), f"{command.epilog}\n{self.examples}"
 
 
 def load(name: str) -> Any:
     """The command itself. Imports its module. Raises PluginError where it, or an option of it, is a plug-in's and can't be used."""
-    own, module = typer.Typer(rich_markup_mode="rich"), _MODULES[name]
+    own = typer.Typer(rich_markup_mode="rich")
+    module = next(entry.module for entry in ENTRIES if entry.name == name)
     if any(entry.name == name for entry in _OWN):
         import_module(module).register(own)
     else:
@@ -180,11 +143,53 @@ def load(name: str) -> Any:
         with blamed(place):
             further.extend(own.registered_commands[0])
             typer.main.get_group(own)
+    if name not in _LOCAL:
+        for info in (*own.registered_commands, *(each for group in own.registered_groups for each in _members(group))):
+            info.callback = _for_server(info.callback) if info.callback else None
     command: Any = typer.main.get_group(own).commands[name]
     for each in (command, *getattr(command, "commands", {}).values()):
-        # a docstring's line breaks are the source's; the terminal's width decides on its own
-        each.help = _LINE_END.sub(" ", each.help or "")
+        set_forms(each.params)
+        each.format_help = partial(print_help, each)
     return command
+
+
+def _members(group: TyperInfo) -> Iterator[CommandInfo | TyperInfo]:
+    """What of a group takes options."""
+    assert group.typer_instance is not None
+    yield from group.typer_instance.registered_commands
+    if group.typer_instance.registered_callback:
+        yield group.typer_instance.registered_callback
+
+
+def _use_server(ctx: typer.Context, url: str | None) -> str | None:
+    if url is not None:
+        if not url.strip():
+            raise UsageError("--server: give the URL of a controller, such as http://127.0.0.1:8080")
+        os.environ["MUSTER_URL"] = ctx.meta[_SERVER] = url
+    return url
+
+
+ServerOption = Annotated[
+    str | None,
+    typer.Option(
+        "--server",
+        metavar="URL",
+        callback=_use_server,
+        is_eager=True,
+        help="URL of the controller; default: $MUSTER_URL, else this home directory's. $MUSTER_TOKEN is its key.",
+    ),
+]
+"""Every command for a controller has it, before and after its name."""
+
+
+def _for_server(own: Callable[..., Any]) -> Callable[..., Any]:
+    """The command with :data:`ServerOption`, whose callback has done its work before the command runs."""
+
+    def without(server: str | None, **values: Any) -> Any:
+        return own(**values)
+
+    place = inspect.Parameter("server", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=ServerOption)
+    return in_place_of(own, without, place)
 
 
 class Catalogue(CommandGroup):
@@ -192,7 +197,12 @@ class Catalogue(CommandGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, found, rest = super().resolve_command(ctx, args)  # refuses an unknown name with the nearest known ones
+        if name in _LOCAL and _SERVER in ctx.meta:
+            raise UsageError(f"--server: muster {name} works on this machine, without a controller; leave --server out")
         return name, load(name) if found is not None and name else None, rest
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        print_help(self, ctx)
 
 
 def add_placeholders(app: typer.Typer) -> None:

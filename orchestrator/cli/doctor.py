@@ -19,7 +19,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.command_options import JsonOption, StoreOption
 from orchestrator.cli.terminal import Console, echo_json
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError, Unreachable
@@ -60,14 +60,17 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(
-    engine: Annotated[list[str] | None, typer.Option(help="An engine that must work here. Repeatable.")] = None,
-    store: Annotated[
-        str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")
+    engine: Annotated[
+        list[str] | None, typer.Option(metavar="ENGINE", help="An engine that must work here. Repeatable.")
     ] = None,
+    store: StoreOption = None,
     worker: Annotated[bool, typer.Option("--worker", help="Require that this machine can run nodes.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Check whether this machine meets Muster's requirements; exit 1 if a requested part is missing."""
+    """Check whether this machine meets Muster's requirements.
+
+    It exits with 1 if a requested part is missing.
+    """
     findings = list(_examine(engine or [], Path(store).expanduser() if store else muster_home() / "store", worker))
     if as_json:
         echo_json([asdict(finding) for finding in findings], indent=1)
@@ -94,9 +97,9 @@ def _examine(engines: Sequence[str], store: Path, worker: bool) -> Iterator[Find
         yield _checked(f"engine {name}", partial(_engine, name))
 
 
-def _checked(what: str, look: Callable[[], str]) -> Finding:
+def _checked(what: str, check: Callable[[], str]) -> Finding:
     try:
-        return Finding(what, "ok", look())
+        return Finding(what, "ok", check())
     except OSError as error:
         return Finding(what, "bad", f"{error.filename}: {error.strerror}")
     except EngineError as error:
@@ -152,7 +155,7 @@ def _shared_memory() -> Finding:
     try:
         size = shutil.disk_usage("/dev/shm").total / 2**20
     except OSError:
-        return Finding("/dev/shm", "absent", "there is none; NCCL between GPUs of one machine needs it")
+        return Finding("/dev/shm", "absent", "missing; NCCL between GPUs of one machine needs it")
     if size < _LEAST_SHARED_MEMORY:
         return Finding("/dev/shm", "absent", f"{size:.0f} MiB; several GPUs on a node need more: --shm-size 2g")
     return Finding("/dev/shm", "ok", f"{size:.0f} MiB")

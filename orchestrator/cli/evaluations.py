@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.clones import split_reference
-from orchestrator.cli.jobs import AcceptOption, JsonOption, engine_queue, on_queue, store_of, submit_spec, tell_note
-from orchestrator.cli.progress import await_end, summary
-from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
+from orchestrator.cli import command_options as options
+from orchestrator.cli.controllers import controller
+from orchestrator.cli.progress import summary
+from orchestrator.cli.submitting import carry_out, note, queue_change, store_of
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.spec.changes import override
@@ -30,14 +30,8 @@ def register(app: typer.Typer) -> None:
 
 
 def evaluate(
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="RUN[@ITERATION|@best|@latest]",
-            help="The policy: of a run's newest checkpoint, unless you name one.",
-        ),
-    ],
-    episodes: Annotated[int | None, typer.Option(help="Episodes in all; 100 by default.", show_default=False)] = None,
+    source: options.CheckpointArgument,
+    episodes: Annotated[int | None, typer.Option(help="Episodes in all; 100 by default.")] = None,
     worlds: Annotated[
         int | None,
         typer.Option(help="Worlds that each rank simulates at once; 1024 by default, at most one for each episode."),
@@ -50,19 +44,23 @@ def evaluate(
         list[str] | None,
         typer.Option(
             "--set",
+            metavar="KEY=VALUE",
             help="Change the worlds (config.randomize.friction=[0.4, 0.6]) or a key of the job (resources.cpus=4). Repeatable.",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the job; evaluate-RUN by default.")] = None,
-    accept_changed_robot: AcceptOption = False,
-    engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
-    as_json: JsonOption = False,
+    name: Annotated[str | None, typer.Option("--name", help="Name of the job; default: evaluate-RUN.")] = None,
+    accept_changed_robot: options.AcceptOption = False,
+    queue: options.QueueOption = None,
+    engine: options.EngineOption = None,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+    follow: options.DetachOption = True,
+    dry_run: options.DryRunOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
-    """Evaluate a checkpoint: whole episodes in worlds that its training has not seen.
+    """Evaluate a checkpoint in worlds that its training has not seen.
 
-    This submits a job and follows it to its end, with a temporary controller if none is running. The policy takes its mean action. The
+    This submits a job of whole episodes and follows it to its end, with a temporary controller if none is running. The policy takes its mean action. The
     run's evaluations/ gets a Parquet file with one row per episode, and a summary. The job has one node, with the resources of the run's
     nodes, but at most one GPU.
     """
@@ -72,17 +70,19 @@ def evaluate(
         "seed": seed,
         "accept_changed_robot": accept_changed_robot or None,
     }
-    request = EvaluationRequest(source, section, set_ or (), name, engine, store, cpus, as_json)
+    request = EvaluationRequest(
+        source, section, set_ or (), name, engine, store, cpus, as_json, queue=queue, follow=follow, dry_run=dry_run
+    )
     raise typer.Exit(follow_evaluation(request))
 
 
 @dataclass(frozen=True)
 class EvaluationRequest:
-    """What a user asks of an evaluation.
+    """The request of a user for an evaluation.
 
     Attributes:
         source: ``RUN[@ITERATION|@best|@latest]``.
-        section: What the job's section says beside run and checkpoint; None is left out.
+        section: Of the job, beside run and checkpoint; None is left out.
         changes: ``key=value``, of the worlds or of the job.
         name: Of the job; KIND-RUN where None.
         engine: That runs the job.
@@ -90,6 +90,9 @@ class EvaluationRequest:
         cpus: Of a temporary controller.
         as_json: Whether the summary is printed as JSON.
         kind: Key of the job's section.
+        queue: Of the job; that of its training where None.
+        follow: Whether the command waits for the end of the job.
+        dry_run: Whether nothing is submitted.
     """
 
     source: str
@@ -101,6 +104,9 @@ class EvaluationRequest:
     cpus: float | None = None
     as_json: bool = False
     kind: str = "evaluate"
+    queue: str | None = None
+    follow: bool = True
+    dry_run: bool = False
 
 
 def follow_evaluation(request: EvaluationRequest, then: Callable[[Path, str], None] | None = None) -> int:
@@ -116,60 +122,48 @@ def follow_evaluation(request: EvaluationRequest, then: Callable[[Path, str], No
     Raises:
         UsageError, SpecError, ApiError, ServerError: One line each.
     """
-    run, checkpoint = split_reference(request.source)
+    run, checkpoint = options.split_reference(request.source)
     section = {key: value for key, value in {"checkpoint": checkpoint, **request.section}.items() if value is not None}
     with controller(request.store, request.cpus) as connect:
         client = connect()
-        elsewhere = on_queue(request.changes, None if request.engine is None else engine_queue(client, request.engine))
-        spec = _spec(client, named(run), request.name, section, request.changes, elsewhere, request.kind)
-        job = submit_spec(client, spec, f"evaluate {request.source}")["jobId"]
-        code = see_through(client, job, await_end if request.as_json else _told)
-        if code == 0 and (request.as_json or then):
+        elsewhere = queue_change(client, request.changes, request.queue, request.engine)
+        spec = _spec(client, named(run), request, section, elsewhere)
+        modes = {"follows": request.follow, "dry_run": request.dry_run, "as_json": request.as_json}
+        code, job = carry_out(client, spec, f"evaluate {request.source}", _printed, **modes)
+        if job and code == 0 and (request.as_json or then):
             found = client.get(f"/api/runs/{named(run)}/evaluations")
-            summary = next(each for each in found if each.get("job") == job)
+            result = next(each for each in found if each.get("job") == job)
             if then:
-                then(Path(client.get(f"/api/runs/{named(run)}")["path"]), summary["name"])
+                then(Path(client.get(f"/api/runs/{named(run)}")["path"]), result["name"])
             if request.as_json:
-                echo_json(summary, indent=1)
+                echo_json(result, indent=1)
     return code
 
 
 def _spec(
-    client: Client,
-    run: str,
-    name: str | None,
-    section: dict[str, Any],
-    changes: Sequence[str] | None,
-    elsewhere: Sequence[str],
-    kind: str,
+    client: Client, run: str, request: EvaluationRequest, section: Mapping[str, Any], elsewhere: Sequence[str]
 ) -> Spec:
     """The job, on nodes like the training's. Raises SpecError, and ApiError for an unknown run."""
-    trained = client.get(f"/api/runs/{run}")["spec"] or {}
-    document = evaluation_document(run, trained, section, name, kind)
-    worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
+    kind, trained = request.kind, client.get(f"/api/runs/{run}")["spec"] or {}
     source = f"{'evaluation' if kind == 'evaluate' else kind} of {run}"
-    changed = override(document, [*worlds, *elsewhere])
+    worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in request.changes]
+    document = override(evaluation_document(run, trained, section, request.name, kind), [*worlds, *elsewhere])
     train = trained.get("train") or {}
-    task, base = train.get("task"), train.get("config") or {}
     whole = with_files(
-        changed,
+        document,
         source,
-        task=task,
-        base=base,
+        task=train.get("task"),
+        base=train.get("config") or {},
         store=partial(store_of, client),
-        note=tell_note,
+        note=note,
         text_of=partial(client.run_text, run),
     )
     return validate(whole, source)
 
 
-def _told(client: Client, job: str) -> int:
+def _printed(client: Client, job: str) -> int:
     """Print the main rank's output, and how the job ended if it did not succeed. Returns the exit code."""
     for line in client.logs(job, follow=True):
         if line["rank"] == 0:
             echo(line["text"])
-    return _ended(client, job)
-
-
-def _ended(client: Client, job: str) -> int:
     return 0 if client.get(f"/api/jobs/{job}")["status"] == "SUCCEEDED" else summary(client, job)

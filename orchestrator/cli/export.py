@@ -7,11 +7,13 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.clones import split_reference
-from orchestrator.cli.jobs import AcceptOption, submit_spec
-from orchestrator.cli.serving import StoreOption, controller, see_through
-from orchestrator.cli.terminal import echo
-from orchestrator.client import Client, named
+from orchestrator.cli import command_options as options
+from orchestrator.cli.controllers import controller, see_through
+from orchestrator.cli.listings import show_facts
+from orchestrator.cli.progress import await_end, follow
+from orchestrator.cli.runs import chosen
+from orchestrator.cli.submitting import submit_spec
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.spec.changes import override
 from orchestrator.spec.model import validate
@@ -23,21 +25,13 @@ from shared_store.volume.layout import Store
 _EXAMPLES = """Examples:  muster export ant-1f2e3d4c -o ant-policy
 muster export ant-1f2e3d4c@300 --episodes 64 --set resources.gpus=1"""
 
-CheckpointArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="RUN[@ITERATION|@best|@latest]",
-        help="The policy: of a run's newest checkpoint, of an iteration's, or of the one with the best score.",
-    ),
-]
-
 
 def register(app: typer.Typer) -> None:
     app.command(epilog=_EXAMPLES)(export)
 
 
 def export(
-    source: CheckpointArgument,
+    source: options.CheckpointArgument,
     output: Annotated[
         Path | None, typer.Option("--output", "-o", help="Copy the bundle to this directory, which must not exist.")
     ] = None,
@@ -45,81 +39,77 @@ def export(
         int, typer.Option(min=0, help="Judge the bundle on at least this many episodes; 0: compare only its actions.")
     ] = 16,
     worlds: Annotated[int, typer.Option(min=1, help="Number of simulated worlds in the comparison.")] = 16,
-    set_: Annotated[
-        list[str] | None, typer.Option("--set", help="Change a key of the job: resources.gpus=1. Repeatable.")
-    ] = None,
-    accept_changed_robot: AcceptOption = False,
-    store: StoreOption = None,
+    set_: options.SetOption = None,
+    accept_changed_robot: options.AcceptOption = False,
+    store: options.StoreOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
-    """Export a policy as a bundle for a robot (ONNX, contract, self-test), checked against the policy.
+    """Export a policy as a bundle for a robot, and check it.
 
-    A job writes it to the run's exports/, with a temporary controller if none is running. The bundle appears only if its policy acts like
-    the trained one on recorded observations (within 1e-5) and performs as well in the same simulated worlds.
+    A job writes ONNX, contract and self-test to the run's exports/, with a temporary controller if none is running. The bundle appears
+    only if its policy acts like the trained one on recorded observations (within 1e-5) and performs as well in the same simulated worlds.
     """
     if output is not None and output.exists():
         raise UsageError(f"-o {output}: exists already; name a new directory")
-    run, wanted = split_reference(source)
+    run, reference = options.split_reference(source)
     with controller(store, None) as connect:
         client = connect()
-        checkpoint = chosen(client, run, wanted)
+        checkpoint = chosen(client, run, reference)
         section = {"run": run, "checkpoint": checkpoint["iteration"], "episodes": episodes, "worlds": worlds}
         section |= {"accept_changed_robot": accept_changed_robot}
         document = {"name": f"export-{run}"[:128], "resources": {"cpus": 1, "memory": "2GiB"}, "export": section}
         spec = validate(override(document, set_ or []), "muster export")
-        code = see_through(client, submit_spec(client, spec, "muster export")["jobId"])
+        job = submit_spec(client, spec, "muster export")["jobId"]
+        code = see_through(client, job, await_end if as_json else follow)
         if code == 0:
             place = Store(client.get("/api/capacity")["store"]).run(run).exports / checkpoint["name"]
-            _tell(place, output)
+            facts = _checks(place, output)
+            if as_json:
+                echo_json({"run": run, "iteration": checkpoint["iteration"], "jobId": job, **facts}, indent=1)
+            elif facts["report"] is None:
+                echo(_elsewhere(place))
+            else:
+                _show(facts)
     raise typer.Exit(code)
 
 
-def chosen(client: Client, run: str, wanted: int | str | None) -> dict[str, Any]:
-    """The API's description of the referenced checkpoint. Raises UsageError with the nearest one."""
-    found: list[dict[str, Any]] = client.get(f"/api/runs/{named(run)}/checkpoints")
-    if not found:
-        raise UsageError(f"run {run} has no checkpoint yet; train it first")
-    if wanted in (None, "latest"):
-        return found[-1]
-    if wanted == "best":
-        best = next((each for each in found if each["best"]), None)
-        if best is None:
-            raise UsageError(f"run {run} has no checkpoint with a score or two evaluations yet; name an iteration")
-        return best
-    there = [each for each in found if each["iteration"] == wanted]
-    if not there:
-        iterations = [str(each["iteration"]) for each in found]
-        near = min(found, key=lambda each: abs(each["iteration"] - int(wanted)))["iteration"]
-        raise UsageError(
-            f"run {run} has no checkpoint of iteration {wanted}; the nearest is {near}; it has: {', '.join(iterations)}"
-        )
-    return there[-1]
+def _elsewhere(place: Path) -> str:
+    return f"the bundle is in the controller's store, {place}, which is not on this machine"
 
 
-def _tell(place: Path, output: Path | None) -> None:
-    """Print the results of the bundle's checks, and copy it. Raises ServerError if the store is on another machine."""
+def _checks(place: Path, output: Path | None) -> dict[str, Any]:
+    """Copy the bundle. Raises ServerError if it can't be copied.
+
+    Returns:
+        ``bundle``: its path; ``files``, ``bytes``; ``report``: the results of its checks. None where the store is on another machine.
+    """
     if not place.is_dir():
-        where = f"the bundle is in the controller's store, {place}, which is not on this machine"
         if output is not None:
-            raise ServerError(f"-o {output}: {where}; copy it from there")
-        echo(where)
-        return
+            raise ServerError(f"-o {output}: {_elsewhere(place)}; copy it from there")
+        return {"bundle": str(place), "files": None, "bytes": None, "report": None}
     try:
         report = read_json(place / bundles.REPORT) or {}
-        manifest = bundles.verify(place)
+        files = bundles.verify(place)["files"]
         if output is not None:
             bundles.copy(place, output)
     except (OSError, ValueError, bundles.DamagedBundle) as error:
         raise ServerError(str(error)) from None
-    size = sum(entry["size"] for entry in manifest["files"].values())
-    parity, judged = report.get("parity") or {}, report.get("judged")
+    size = sum(entry["size"] for entry in files.values())
+    return {"bundle": str(output or place), "files": len(files) + 1, "bytes": size, "report": report}
+
+
+def _show(facts: dict[str, Any]) -> None:
+    parity, judged = facts["report"].get("parity") or {}, facts["report"].get("judged")
+    shown = {}
     if differences := parity.get("greatest_difference"):
         count = sum((parity.get("observations") or {}).values())
-        told = ", ".join(f"{name} {value:.1e}" for name, value in differences.items())
-        echo(f"  parity:      {told} at most, over {count:,} observations")
+        greatest = ", ".join(f"{name} {value:.1e}" for name, value in differences.items())
+        shown["parity"] = f"{greatest} at most, over {count:,} observations"
     if judged:
         a, b = judged["trained"], judged["bundle"]
         returns = f"return {b['mean_return']:.2f} of the bundle, {a['mean_return']:.2f} of the trained policy"
         known = b.get("success") is not None and a.get("success") is not None
         successes = f"; success {b['success']:.0%} and {a['success']:.0%}" if known else ""
-        echo(f"  judged:      {returns}{successes}; {counted(judged['episodes'], 'episode')}")
-    echo(f"  bundle:      {output or place} ({len(manifest['files']) + 1} files, {size / 1024:.0f} KiB)")
+        shown["judged"] = f"{returns}{successes}; {counted(judged['episodes'], 'episode')}"
+    shown["bundle"] = f"{facts['bundle']} ({facts['files']} files, {facts['bytes'] / 1024:.0f} KiB)"
+    show_facts(shown, width=12)

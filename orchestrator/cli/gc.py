@@ -6,15 +6,24 @@ from collections.abc import Iterator
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource, mebibytes
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client
 from shared_store.contract.error_text import counted
 
 _PATIENCE = 610.0
 """Seconds for a part of a pass: the controller's own limit, and some."""
+GONE = Resource(
+    {
+        "RUN": "run",
+        "JOBS": lambda each: len(each["jobs"]),
+        "WHAT GOES": lambda each: "the run" if each["whole"] else "logs" if each["files"] else "history",
+        "FILES": "files",
+        "SIZE": lambda each: mebibytes(each["bytes"], 2),
+    }
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -31,13 +40,13 @@ def gc(
     older_than: Annotated[
         str | None,
         typer.Option(
+            metavar="DURATION",
             help="Delete what ended longer ago, such as 30d, in queues without a rule. By default: as `muster serve --retention` says.",
-            show_default=False,
         ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Delete old jobs, their logs and their runs, where nothing needs them any more.
+    """Delete old jobs, their logs and their runs, where nothing needs them.
 
     A job goes by the rule of its queue (tag muster:retention, such as 30d), else by `muster serve --retention`; of queues without a rule
     only jobs of the Batch API go, 90 days after their end. Never deleted: runs with checkpoints or any other results, parents of clones,
@@ -51,13 +60,13 @@ def gc(
         echo_json({"taken": not dry_run, "runs": found}, indent=1)
         return
     if dry_run and gone:
-        print_cut(_table(gone))
+        GONE.show(gone)
     for reasons, runs_kept in _by_reasons(kept).items():
         echo(f"kept: {'run' if len(runs_kept) == 1 else 'runs'} {', '.join(runs_kept)}: {reasons}")
     jobs, runs = sum(len(each["jobs"]) for each in gone), sum(each["whole"] for each in gone)
     size = sum(each["bytes"] for each in gone)
     files = counted(sum(each["files"] for each in gone), "file")
-    what = f"{counted(jobs, 'job')} and {counted(runs, 'run')}: {files}, {size / 2**20:.1f} MiB"
+    what = f"{counted(jobs, 'job')} and {counted(runs, 'run')}: {files}, {mebibytes(size)}"
     echo(f"would delete {what}" if dry_run else f"deleted {what}")
     if not found:
         echo("no job of yours is old enough by the rule of its queue; `muster gc --help` says which rules there are")
@@ -66,11 +75,11 @@ def gc(
 def _parts(client: Client, dry_run: bool, older_than: str) -> Iterator[list[dict[str, Any]]]:
     place: str | None = ""
     while place is not None:
-        asked = {"after": place, "older_than": older_than}
+        body = {"after": place, "older_than": older_than}
         part = (
-            client.get("/api/gc", **asked, seconds=_PATIENCE)
+            client.get("/api/gc", **body, seconds=_PATIENCE)
             if dry_run
-            else client.post("/api/gc", asked, seconds=_PATIENCE)
+            else client.post("/api/gc", body, seconds=_PATIENCE)
         )
         yield part["runs"]
         place = part["next"]
@@ -83,13 +92,3 @@ def _by_reasons(kept: list[dict[str, Any]]) -> dict[str, list[str]]:
         names = found.setdefault("; ".join(each["kept"]), [])
         names += [each["run"]] if each["run"] not in names else []
     return found
-
-
-def _table(found: list[dict[str, Any]]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for column in ("RUN", "JOBS", "WHAT GOES", "FILES", "SIZE"):
-        table.add_column(column, no_wrap=True)
-    for each in found:
-        what = "the run" if each["whole"] else "logs" if each["files"] else "history"
-        table.add_row(each["run"], str(len(each["jobs"])), what, str(each["files"]), f"{each['bytes'] / 2**20:.2f} MiB")
-    return table

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.command_options import DatabaseOption, JsonOption
+from orchestrator.cli.listings import Resource, date_ms
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.terminal import echo, echo_json, print_rows
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import EXAMPLE_URL
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError
 from orchestrator.home import ControllerRuns, HomeLock, local_database, local_region, local_url, muster_home
@@ -26,14 +25,17 @@ from orchestrator.persistence.session import Database, DatabaseTaken
 from orchestrator.persistence.urls import database_url, shown
 
 NameArgument = Annotated[str, typer.Argument(help="Name of the key: its user or program.")]
-DatabaseOption = Annotated[
-    str | None,
-    typer.Option(
-        envvar="MUSTER_DATABASE",
-        help="The controller's database, as `muster serve` has it; $MUSTER_HOME/muster.db by default.",
-        show_default=False,
-    ),
-]
+KEYS = Resource(
+    {
+        "NAME": lambda key: key.name,
+        "ACCESS KEY ID": lambda key: key.access_key_id,
+        "MAY": lambda key: key.rights,
+        "SHARE": lambda key: key.share,
+        "CREATED": lambda key: date_ms(key.created_at),
+    },
+    "no keys yet; create one with: muster keys create NAME",
+    whole=True,
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -50,15 +52,15 @@ def register(app: typer.Typer) -> None:
 def create(
     name: NameArgument,
     queue: Annotated[
-        list[str] | None, typer.Option(help="A job queue that the key may use; repeatable. All queues by default.")
+        list[str] | None,
+        typer.Option("--queue", metavar="QUEUE", help="A job queue that the key may use; repeatable. Default: all."),
     ] = None,
     read_only: Annotated[bool, typer.Option("--read-only", help="The key may read but change nothing.")] = False,
     share: Annotated[
         str | None,
         typer.Option(
             help="Share identifier of its jobs in queues with a fair-share policy; several keys may have one. By default the letters and "
-            "digits of its name.",
-            show_default=False,
+            "digits of its name."
         ),
     ] = None,
     database: DatabaseOption = None,
@@ -89,28 +91,22 @@ The server of {muster_home()} demands a key from now on; a running one sees this
 
 def list_keys(database: DatabaseOption = None, as_json: JsonOption = False) -> None:
     """List the keys, without their secrets."""
-    with opened(muster_home(), database) as there:
-        keys = there.current().values()
+    with opened(muster_home(), database) as store:
+        keys = [*store.current().values()]
     if as_json:
         echo_json([key.describe() for key in keys], indent=1)
-        return
-    if not keys:
-        echo("no keys yet; create one with: muster keys create NAME")
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("NAME", "ACCESS KEY ID", "MAY", "SHARE", "CREATED"):
-        table.add_column(column, no_wrap=column != "MAY")
-    for key in keys:
-        created = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(key.created_at / 1000))
-        table.add_row(key.name, key.access_key_id, key.rights, key.share, created)
-    print_rows(table)
+    else:
+        KEYS.show(keys)
 
 
-def delete(name: NameArgument, database: DatabaseOption = None) -> None:
+def delete(name: NameArgument, database: DatabaseOption = None, as_json: JsonOption = False) -> None:
     """Delete a key: a running server refuses it within a second. After the last key, print who can still connect."""
     with opened(muster_home(), database) as keys:
         keys.delete(name)
         left = keys.current()
+    if as_json:
+        echo_json({"name": name, "keys": len(left)})
+        return
     echo(f"deleted key {name}")
     if not left:
         echo(
@@ -156,5 +152,5 @@ def _check_same(home: Path, database: str | None) -> None:
     running = local_database(home)
     if running is not None and running != shown(str(make_url(database_url(home, database)))):
         raise UsageError(
-            f"the controller of {home} has its keys in {running}: give that with --database, or as MUSTER_DATABASE"
+            f"the controller of {home} has its keys in {running}: set --database or MUSTER_DATABASE to that"
         )

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from orchestrator.cli.clones import split_reference
-from orchestrator.cli.export import CheckpointArgument
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli import command_options as options
+from orchestrator.cli.controllers import controller
+from orchestrator.cli.listings import Resource, date, number, show_facts
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.serving import StoreOption, controller
-from orchestrator.cli.show import scored
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import named
 from orchestrator.domain.errors import UsageError
 from shared_store.contract.documents import DocumentError
@@ -26,7 +22,19 @@ from shared_store.contract.policy_changes import differences, robot_changes
 from shared_store.volume.bundles import POLICY
 from shared_store.volume.evaluations import in_one_line, told_changes
 
-ModelArgument = Annotated[str, typer.Argument(metavar="NAME[@VERSION]", help="A model; its newest version by default.")]
+MODELS = Resource(
+    {
+        "MODEL": "name",
+        "VERSION": "version",
+        "TASK": "task",
+        "RUN": "run",
+        "ITERATION": "iteration",
+        "RETURN": lambda model: _return(model),
+        "REGISTERED": lambda model: date(model.get("registered")),
+    },
+    "no model is registered yet; muster models register RUN --name NAME",
+    "/api/models",
+)
 
 _EXAMPLES = """Examples:  muster export ant-1f2e3d4c@best   then   muster models register ant-1f2e3d4c@best --name ant
 muster models verify ant@1"""
@@ -34,11 +42,11 @@ muster models verify ant@1"""
 
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "Manage exported policies: register, list, show, diff, verify. Versions are immutable.",
+        "Register, list, show, compare and verify exported policies.\n\nVersions are immutable.",
         _EXAMPLES,
     )
     group.command("register", epilog="Example:  muster models register ant-1f2e3d4c@best --name ant")(register_model)
-    group.command("list", epilog="Example:  muster models list --json")(list_models)
+    MODELS.add_list(group, "List the newest version of each model.", "Example:  muster models list --json")
     group.command("show", epilog="Example:  muster models show ant@2")(show)
     group.command("diff", epilog="Example:  muster models diff ant@1 ant@2")(diff)
     group.command("verify", epilog="Example:  muster models verify ant")(verify)
@@ -46,16 +54,16 @@ def register(app: typer.Typer) -> None:
 
 
 def register_model(
-    source: CheckpointArgument,
-    name: Annotated[str, typer.Option(help="Name of the model; its versions count up from 1.")],
+    source: options.CheckpointArgument,
+    name: Annotated[str, typer.Option("--name", help="Name of the model; its versions count up from 1.")],
     again: Annotated[
         bool, typer.Option("--again", help="Register a checkpoint again that the model already has.")
     ] = False,
-    store: StoreOption = None,
-    as_json: JsonOption = False,
+    store: options.StoreOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Register a checkpoint's bundle, made by `muster export`, as the next version of a model."""
-    run, checkpoint = split_reference(source)
+    run, checkpoint = options.split_reference(source)
     with controller(store, None) as connect:
         body = {"name": name, "checkpoint": checkpoint, "again": again}
         found = connect().post(f"/api/runs/{named(run)}/models", body, seconds=300)
@@ -65,73 +73,57 @@ def register_model(
         echo(f"registered {found['run']}@{found['iteration']} as {found['name']}@{found['version']}: {found['path']}")
 
 
-def list_models(store: StoreOption = None, as_json: JsonOption = False) -> None:
-    """List the newest version of each model."""
-    with controller(store, None) as connect:
-        found = connect().get("/api/models")
-    if as_json:
-        echo_json(found, indent=1)
-        return
-    if not found:
-        echo("no model is registered yet; muster models register RUN --name NAME")
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("MODEL", "VERSION", "TASK", "RUN", "ITERATION", "RETURN", "REGISTERED"):
-        table.add_column(column, no_wrap=True)
-    for each in found:
-        table.add_row(
-            *(each["name"], str(each["version"]), str(each.get("task", "-")), str(each.get("run", "-"))),
-            *(str(each.get("iteration", "-")), _return(each), _when(each.get("registered"))),
-        )
-    print_cut(table)
-
-
 def _return(model: dict[str, Any]) -> str:
     """The mean return of its evaluation with the most episodes in the training's worlds, or else the training's score."""
     own = [each for each in model.get("evaluations") or [] if not each.get("config")]
     best = max(own, key=lambda each: each["episodes"], default=None)
-    return f"{best['mean_return']:.2f}" if best else scored(model.get("score"), None)
+    return number(best["mean_return"] if best else model.get("score"))
 
 
-def show(model: ModelArgument, store: StoreOption = None, as_json: JsonOption = False) -> None:
+def show(model: options.ModelArgument, store: options.StoreOption = None, as_json: options.JsonOption = False) -> None:
     """Show a model's origin, evaluation and bundle."""
     found = _read(model, store)
     if as_json:
         echo_json(found, indent=1)
         return
-    parent = found.get("parent")
+    parent, made_with = found.get("parent"), (found.get("made_with") or {}).items()
     echo(f"{found['name']}@{found['version']}, of versions {', '.join(map(str, found['versions']))}")
-    echo(f"  task:        {found.get('task')}, algorithm {found.get('algorithm')}")
-    echo(f"  from:        run {found.get('run')}, checkpoint {found.get('checkpoint')}")
-    if parent:
-        echo(f"  parent:      run {parent.get('run')}, checkpoint {parent.get('checkpoint')}")
+    show_facts(
+        {
+            "task": f"{found.get('task')}, algorithm {found.get('algorithm')}",
+            "from": f"run {found.get('run')}, checkpoint {found.get('checkpoint')}",
+            "parent": f"run {parent.get('run')}, checkpoint {parent.get('checkpoint')}" if parent else "",
+        },
+        width=12,
+    )
     for evaluation in found.get("evaluations") or []:
         changed = ", ".join(f"{place} {value}" for place, value in told_changes(evaluation))
         seed = evaluation.get("seed")
         worlds = "at the end of the training" if seed is None else f"seed {seed}"
         echo(f"  evaluation:  {in_one_line(evaluation)}, {worlds}{f', with {changed}' if changed else ''}")
+    facts: dict[str, object] = {}
     if judged := found.get("judged"):
-        echo(
-            f"  judged:      return {judged['bundle']['mean_return']:.2f} of the bundle, {counted(judged['episodes'], 'episode')}"
-        )
-    if found.get("changed_robot"):
-        echo(f"  robot:       {found['changed_robot']}; the bundle was made and judged with that file")
-    versions = ", ".join(f"{name} {version}" for name, version in (found.get("made_with") or {}).items())
-    echo(f"  made with:   {versions or 'not known'}")
-    echo(f"  registered:  {_when(found.get('registered'))} by {found.get('registered_by')}")
-    echo(f"  bundle:      {found['path']}/bundle")
-    if found.get("problem"):
-        echo(f"  problem:     {found['problem']}")
+        episodes = counted(judged["episodes"], "episode")
+        facts["judged"] = f"return {judged['bundle']['mean_return']:.2f} of the bundle, {episodes}"
+    if robot := found.get("changed_robot"):
+        facts["robot"] = f"{robot}; the bundle was made and judged with that file"
+    facts |= {
+        "made with": ", ".join(f"{name} {version}" for name, version in made_with) or "not known",
+        "registered": f"{date(found.get('registered')) or '-'} by {found.get('registered_by')}",
+        "bundle": f"{found['path']}/bundle",
+        "problem": found.get("problem"),
+    }
+    show_facts(facts, width=12)
 
 
 def diff(
-    model: ModelArgument,
+    model: options.ModelArgument,
     other: Annotated[
         str | None,
         typer.Argument(metavar="NAME[@VERSION]", help="Version to compare with; by default the previous one."),
     ] = None,
-    store: StoreOption = None,
-    as_json: JsonOption = False,
+    store: options.StoreOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """List differences between two versions: contract, settings, programs, weights; exit 1 if anything differs."""
     now = _read(model, store)
@@ -163,30 +155,28 @@ def diff(
         raise typer.Exit(1)
 
 
-def verify(model: ModelArgument, store: StoreOption = None) -> None:
+def verify(
+    model: options.ModelArgument, store: options.StoreOption = None, as_json: options.JsonOption = False
+) -> None:
     """Read every file of a model and check its digest; exit 1 if one was altered, removed or added."""
     found = _read(model, store, verify=True)
-    if found.get("problem"):
-        echo(f"{found['name']}@{found['version']}: damaged: {found['problem']}")
+    problem = found.get("problem")
+    if as_json:
+        echo_json({"name": found["name"], "version": found["version"], "problem": problem})
+    else:
+        state = f"damaged: {problem}" if problem else "all files are unchanged since registration"
+        echo(f"{found['name']}@{found['version']}: {state}")
+    if problem:
         raise typer.Exit(1)
-    echo(f"{found['name']}@{found['version']}: all files are unchanged since registration")
 
 
-def _read(reference: str, store: str | None, **options: Any) -> dict[str, Any]:
+def _read(reference: str, store: str | None, **query: Any) -> dict[str, Any]:
     """A model by ``NAME[@VERSION]``. Raises UsageError."""
-    name, version = split_model(reference)
+    name, version = options.split_model(reference)
     with controller(store, None) as connect:
         path = f"/api/models/{named(name)}"
-        found: dict[str, Any] = connect().get(path, seconds=300, version=version, **options)
+        found: dict[str, Any] = connect().get(path, seconds=300, version=version, **query)
     return found
-
-
-def split_model(reference: str) -> tuple[str, int | None]:
-    """Name and version of ``NAME`` or ``NAME@VERSION``. Raises UsageError."""
-    name, sign, version = reference.partition("@")
-    if sign and not (version.isascii() and version.isdecimal() and 0 < len(version) < 10 and int(version) > 0):
-        raise UsageError(f"{reference}: expected a version after @, such as {name}@1")
-    return name, int(version) if sign else None
 
 
 def _weights(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
@@ -196,8 +186,8 @@ def _weights(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
         return ""
     from orchestrator.cli.comparison.weights import difference  # imports the ONNX reader, if that package is installed
 
-    told = difference(*(Path(each["path"]) / "bundle" / POLICY for each in (before, now)))
-    return "" if told == "" else f"weights {told or f'differ: SHA-256 {digests[0][:12]} became {digests[1][:12]}'}"
+    found = difference(*(Path(each["path"]) / "bundle" / POLICY for each in (before, now)))
+    return "" if found == "" else f"weights {found or f'differ: SHA-256 {digests[0][:12]} became {digests[1][:12]}'}"
 
 
 def _changed(place: str, before: Any, now: Any) -> list[str]:
@@ -205,7 +195,3 @@ def _changed(place: str, before: Any, now: Any) -> list[str]:
         keys = sorted({*before, *now})
         return [line for key in keys for line in _changed(f"{place}.{key}", before.get(key), now.get(key))]
     return [] if before == now else [f"{place} {before} became {now}"]
-
-
-def _when(seconds: float | None) -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(seconds)) if seconds else "-"

@@ -9,13 +9,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
+from rich.text import Text
 
+from orchestrator.cli.listings import duration, number, show_facts
 from orchestrator.cli.terminal import Console, echo, echo_raw, one_line, visible
 from orchestrator.client import Client, named
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ApiError, Unreachable
 from orchestrator.domain.job import TERMINAL, WAITING
-from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase, phase_in
 from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.metrics import warnings_of
@@ -34,15 +35,15 @@ def follow(client: Client, job_id: str) -> int:
     if detail["kind"] != "train":
         return _follow_logs(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
-    client.notify = display.tell
+    client.notify = display.note
     seen = 0
     with display:
         while True:
             try:
                 job = client.get(f"/api/jobs/{job_id}", store=False)
-                over, records = job["status"] in TERMINAL, []
+                has_ended, records = job["status"] in TERMINAL, []
                 has_run = any(attempt["epoch"] for attempt in job["attempts"])
-                # the run is there once an attempt has taken it: not yet at the beginning, and never where no attempt started
+                # the run exists once an attempt has taken it: not at the beginning, and never if no attempt started
                 while has_run and (page := client.get(f"/api/runs/{detail['run']}/metrics", after=seen)):
                     records, seen = page, page[-1]["iteration"]
             except Unreachable:
@@ -52,7 +53,7 @@ def follow(client: Client, job_id: str) -> int:
             # not iterations before a resume
             records = [each for each in records if each["time"] * 1000 >= detail["createdAt"]]
             display.show(job, records[-1] if records else None)
-            if over:
+            if has_ended:
                 break
             time.sleep(_POLL)
     return summary(client, job_id)
@@ -67,7 +68,7 @@ def _cause(attempt: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def await_end(client: Client, job_id: str) -> int:
-    """Wait for a job's end without a word on standard output; a failure is told on standard error. Returns the command's exit code."""
+    """Wait for a job's end without output on standard output; a failure is printed on standard error. Returns the command's exit code."""
     for _ in client.logs(job_id, follow=True):
         pass
     return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id, err=True)
@@ -78,48 +79,52 @@ def summary(client: Client, job_id: str, err: bool = False) -> int:
     detail = client.get(f"/api/jobs/{job_id}")
     console = Console(highlight=False, soft_wrap=True, stderr=err)
     succeeded = detail["status"] == "SUCCEEDED"
-    colour = "green" if succeeded else "red"
     reason = "" if succeeded else f": {one_line(detail['statusReason'])}"
-    console.print(f"[{colour}]{detail['status']}[/]  {reasons.named(detail['name'], detail['id'])}", end="")
-    console.print(reason, markup=False)
+    status = (detail["status"], "green" if succeeded else "red")
+    console.print(Text.assemble(status, f"  {reasons.named(detail['name'], detail['id'])}{reason}"))
     results = detail["results"] or {}
     attempt = detail["attempts"][-1] if detail["attempts"] else None
     first = _cause(attempt) if attempt and not succeeded else None
     if first and first.get("error") and one_line(first["error"]) not in one_line(detail["statusReason"]):
-        console.print(f"  first error: node {first['index']}: {one_line(first['error'])}", markup=False)
-    evaluation = results.get("evaluation")
-    if succeeded and evaluation:
-        console.print(f"  evaluation:  {in_one_line(evaluation)}")
-    if succeeded and (best := best_told(detail["run"], results.get("best"))):
-        console.print(f"  best:        {best}")
-    log = (first or attempt["nodes"][0])["log"] if attempt else None
-    known = {name: results.get(name) for name in ("checkpoint", "plot", "picture")}
-    found = {"checkpoint": known.pop("checkpoint"), "log": log, **known, "run": detail["run"]}
-    for name, value in found.items():
-        if value:
-            console.print(f"  {name + ':':12} {value}", markup=False)
+        echo(f"  first error: node {first['index']}: {one_line(first['error'])}", err)
+    evaluation, best = results.get("evaluation"), describe_best(detail["run"], results.get("best"))
+    facts = {
+        "evaluation": in_one_line(evaluation) if succeeded and evaluation else "",
+        "best": best if succeeded else "",
+        "checkpoint": results.get("checkpoint"),
+        "log": (first or attempt["nodes"][0])["log"] if attempt else None,
+        **{name: results.get(name) for name in ("plot", "picture")},
+        "run": detail["run"],
+    }
+    show_facts(facts, width=12, err=err)
     if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
         label = "once that is corrected:" if attempt and attempt.get("fault") else "continue with: "
-        console.print(f"  {label} muster resume {detail['run']}", markup=False)
+        echo(f"  {label} muster resume {detail['run']}", err)
     return 0 if succeeded else 1
 
 
-def best_told(run: str, best: Mapping[str, Any] | None) -> str:
+def outcome(detail: Mapping[str, Any]) -> dict[str, Any]:
+    """What scripts want to know of an ended job."""
+    names = {"jobId": "id", "jobName": "name"} | {name: name for name in ("status", "statusReason", "run", "results")}
+    return {name: detail[key] for name, key in names.items()}
+
+
+def describe_best(run: str, best: Mapping[str, Any] | None) -> str:
     """The best checkpoint by evaluations in one line; empty without at least two to compare."""
     if not best:
         return ""
-    return f"{run}@{best['iteration']}, mean return {best['mean']:.2f}, of {best['of']} checkpoints that are evaluated"
+    return f"{run}@{best['iteration']}, mean return {best['mean']:.2f}, best of {best['of']} evaluated checkpoints"
 
 
 def _follow_logs(client: Client, job_id: str) -> int:
     client.notify = lambda line: echo(line, err=True)
     waits = Waits(client, job_id)
-    waits.tell()
+    waits.show()
     for lines in client.log_batches(job_id, follow=True):
         if lines:
             echo_raw("\n".join(map(_format, lines)))
         else:
-            waits.tell()
+            waits.show()
     return summary(client, job_id)
 
 
@@ -127,17 +132,17 @@ class Waits:
     """Lines on standard error about a job that has nothing to show because it waits."""
 
     def __init__(self, client: Client, job: str) -> None:
-        self._client, self._job, self._told = client, job, ""
+        self._client, self._job, self._printed = client, job, ""
 
-    def tell(self) -> None:
-        """Say why the job waits, where that was not said before."""
+    def show(self) -> None:
+        """Print why the job waits, if that is new."""
         try:
             text = _why_waiting(self._client, self._job)
-        except (ApiError, Unreachable):  # whoever reads the log hears of it
+        except (ApiError, Unreachable):  # the reader of the log meets it, too
             return
-        if text and text != self._told:
+        if text and text != self._printed:
             echo(text, err=True)
-        self._told = text
+        self._printed = text
 
 
 def _why_waiting(client: Client, job: str) -> str:
@@ -150,18 +155,6 @@ def _why_waiting(client: Client, job: str) -> str:
 
 def _format(line: dict[str, Any]) -> str:
     return f"[node {line['node']} rank {'-' if line['rank'] is None else line['rank']}] {visible(line['text'], colours=True)}"
-
-
-def _describe(record: dict[str, Any]) -> dict[str, str]:
-    def number(key: str, pattern: str) -> str:
-        value = record.get(key)
-        return "-" if value is None else format(value, pattern)
-
-    return {
-        "reward": number("reward", ".2f"),
-        "length": number("episode_length", ".1f") + shown_metrics(record),
-        "rate": number("steps_per_second", ",.0f"),
-    }
 
 
 def shown_metrics(record: Mapping[str, Any]) -> str:
@@ -230,7 +223,7 @@ class _Display:
         self._first: tuple[float, int] | None = None
         self._attempt, self._phase, self._since = 0, "", time.monotonic()
 
-    def tell(self, text: str) -> None:
+    def note(self, text: str) -> None:
         """Show why nothing happens."""
         echo(text, err=True)
 
@@ -255,6 +248,19 @@ class _Display:
             return ""
         return f"{self._phase} ({time.monotonic() - self._since:.0f} s)"
 
+    def values(self, record: dict[str, Any]) -> str:
+        """An iteration in one line."""
+        iteration = record["iteration"]
+        parts = [
+            f"{iteration}/{self.total}",
+            f"reward {number(record.get('reward')) or '-'}",
+            f"length {number(record.get('episode_length'), '.1f') or '-'}{shown_metrics(record)}",
+            f"steps/s {number(record.get('steps_per_second'), ',.0f') or '-'}",
+            f"ETA {self.eta(record)}" if iteration < self.total else "",
+            f"nodes {self.nodes}",
+        ]
+        return "  ".join(filter(None, parts))
+
     def eta(self, record: dict[str, Any]) -> str:
         """Remaining time at the pace since the first displayed iteration (at first: of that iteration), as h:mm:ss."""
         now, iteration = time.monotonic(), record["iteration"]
@@ -262,8 +268,7 @@ class _Display:
             self._first = (now, iteration)
         done = iteration - self._first[1]
         pace = (now - self._first[0]) / done if done else record.get("iteration_seconds", 0.0)
-        left = int((self.total - iteration) * pace)
-        return f"{left // 3600}:{left // 60 % 60:02}:{left % 60:02}"
+        return duration((self.total - iteration) * pace)
 
 
 class _Bar(_Display):
@@ -286,21 +291,16 @@ class _Bar(_Display):
     def __exit__(self, *_: object) -> None:
         self._progress.stop()
 
-    def tell(self, text: str) -> None:
+    def note(self, text: str) -> None:
         self._progress.update(self._task, text=one_line(text))
 
     def show(self, job: dict[str, Any], record: dict[str, Any] | None) -> None:
         self.enter(job)
         if record:
-            values = _describe(record)
-            iteration = self.iteration = record["iteration"]
-            left = f"ETA {self.eta(record)}" if iteration < self.total else ""
-            parts = [
-                *(f"{iteration}/{self.total}", f"reward {values['reward']}", f"length {values['length']}"),
-                *(f"{values['rate']} steps/s", left, counted(self.nodes, "node")),
-                *(f"warning: {one_line(each)}" for each in warnings_of(record, self.run)),
-            ]
-            self._progress.update(self._task, completed=iteration, text="  ".join(filter(None, parts)))
+            self.iteration = record["iteration"]
+            warnings = [f"warning: {one_line(each)}" for each in warnings_of(record, self.run)]
+            text = "  ".join([self.values(record), *warnings])
+            self._progress.update(self._task, completed=self.iteration, text=text)
         elif job["status"] not in ("RUNNING", *TERMINAL):
             self._progress.update(self._task, text=f"{job['status']}: {one_line(job['statusReason'] or '')}")
         elif self.doing:
@@ -341,12 +341,7 @@ class _Lines(_Display):
     def _flush(self) -> None:
         if self._latest is None:
             return
-        values, iteration = _describe(self._latest), self._latest["iteration"]
-        left = f"ETA {self.eta(self._latest)}  " if iteration < self.total else ""
-        echo(
-            f"iteration {iteration}/{self.total}  reward {values['reward']}  length {values['length']}  "
-            f"steps/s {values['rate']}  {left}nodes {self.nodes}"
-        )
+        echo(f"iteration {self.values(self._latest)}")
         for each in warnings_of(self._latest, self.run):
             echo(f"warning: {one_line(each)}")
         self._latest, self._printed = None, time.monotonic()

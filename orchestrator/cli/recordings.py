@@ -1,4 +1,4 @@
-"""``muster record`` and ``muster render``: recordings, films and pictures of policies."""
+"""``muster record``, ``render`` and ``view``: recordings, films, pictures and live views of policies."""
 
 from __future__ import annotations
 
@@ -13,50 +13,47 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.clones import split_reference
-from orchestrator.cli.export import chosen
-from orchestrator.cli.jobs import AcceptOption, submit_spec
+from orchestrator.cli import command_options as options
+from orchestrator.cli.controllers import controller
+from orchestrator.cli.outputs import check_output
 from orchestrator.cli.progress import Activity
-from orchestrator.cli.serving import CpusOption, StoreOption, controller
-from orchestrator.cli.terminal import echo
+from orchestrator.cli.runs import chosen
+from orchestrator.cli.submitting import submit_spec
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, UsageError
 from orchestrator.spec.model import Record, Render, Spec
 from orchestrator.spec.sections import Resources, Retry
 from shared_store.process.tether import start_tied
 
-SourceArgument = Annotated[
-    str | None,
-    typer.Argument(
-        metavar="RUN[@ITERATION|@best|@latest] | JOB",
-        help="A run's newest checkpoint, that of an iteration, or the one with the best score.",
-    ),
-]
-OutOption = Annotated[Path | None, typer.Option("--output", "-o", help="The file to write.", show_default=False)]
-OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
-_RUNNING = ("STARTING", "RUNNING")
+_FILES = (".mcap", ".partial", ".rrd")
+_VIEWER = "worker.telemetry.live_view"
 
 
 def register(app: typer.Typer) -> None:
     app.command(epilog="Example:  muster record ant-1f2e3d4c@best -o ant.mcap --worlds 4 --episodes 2")(record)
     app.command(epilog="Example:  muster render ant-1f2e3d4c -o gait.gif --seconds 6")(render)
+    app.command(
+        epilog="Examples:  muster view cartpole   muster view ant-1f2e3d4c@best --worlds 2   muster view ant.mcap --port 9100"
+    )(view)
 
 
 def record(
-    source: SourceArgument = None,
-    output: OutOption = None,
-    worlds: Annotated[int, typer.Option(min=1, max=16, help="How many worlds.")] = 4,
-    episodes: Annotated[int, typer.Option(min=1, help="Of each world.")] = 2,
-    overwrite: OverwriteOption = False,
+    source: options.SourceArgument = None,
+    output: options.OutputOption = None,
+    worlds: Annotated[int, typer.Option(min=1, max=16, help="Number of worlds.")] = 4,
+    episodes: Annotated[int, typer.Option(min=1, help="Number of episodes of each world.")] = 2,
+    overwrite: options.OverwriteOption = False,
     recover: Annotated[
         Path | None,
         typer.Option(
-            help="Repair a truncated .mcap.partial into a readable file; nothing is recorded.", metavar="FILE"
+            metavar="FILE", help="Repair a truncated .mcap.partial into a readable file; nothing is recorded."
         ),
     ] = None,
-    accept_changed_robot: AcceptOption = False,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
+    accept_changed_robot: options.AcceptOption = False,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
     """Record a policy in action as an MCAP file, for ROS 2's tools and viewers.
 
@@ -76,11 +73,9 @@ def record(
         client = connect()
         run, live = source_of(client, source)
         if live is not None:
-            options = {"--worlds": str(worlds), "--episodes": str(episodes), "--output": str(output.absolute())}
-            given = [text for pair in options.items() for text in pair]
-            raise typer.Exit(
-                run_worker("worker.telemetry.live_recording", run["path"], "--job", live, *given, run=run["path"])
-            )
+            arguments = ("--worlds", str(worlds), "--episodes", str(episodes), "--output", str(output.absolute()))
+            module = "worker.telemetry.live_recording"
+            raise typer.Exit(run_worker(module, run["path"], "--job", live, *arguments, run=run["path"]))
         section = Record(
             run=run["run"],
             checkpoint=checkpoint_of(client, run, source),
@@ -88,21 +83,22 @@ def record(
             worlds=worlds,
             episodes=episodes,
         )
-        _fetch(client, run, Spec(**_common(run, "record"), record=section), output)
+        _make(client, run, Spec(**_common(run, "record"), record=section), output, as_json)
 
 
 def render(
-    source: SourceArgument,
-    output: OutOption,
+    source: options.SourceArgument,
+    output: options.OutputOption,
     worlds: Annotated[int, typer.Option(min=1, max=16, help="Number of worlds, side by side.")] = 4,
     seconds: Annotated[float, typer.Option(min=0.1, max=600, help="Simulated time.")] = 6.0,
-    size: Annotated[str, typer.Option(help="Width and height of a frame [px].")] = "640x360",
-    overwrite: OverwriteOption = False,
-    accept_changed_robot: AcceptOption = False,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of a frame [px].")] = "640x360",
+    overwrite: options.OverwriteOption = False,
+    accept_changed_robot: options.AcceptOption = False,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+    as_json: options.JsonOption = False,
 ) -> None:
-    """Film a checkpoint's policy in action, or show six moments of it in a picture.
+    """Film a checkpoint's policy in action, or draw six moments of it.
 
     The file's ending decides: .mp4 and .gif are films, .png is a picture.
     """
@@ -116,44 +112,92 @@ def render(
         client = connect()
         run, _ = source_of(client, source)
         values: dict[str, Any] = {"run": run["run"], "checkpoint": checkpoint_of(client, run, source), "worlds": worlds}
-        values |= {"accept_changed_robot": accept_changed_robot}
+        values |= {"accept_changed_robot": accept_changed_robot, "format": output.suffix[1:]}
         values |= {"seconds": seconds, "width": int(found[1]), "height": int(found[2])}
         try:
-            section = Render.model_validate({**values, "format": output.suffix[1:]})
+            section = Render.model_validate(values)
         except ValueError:
             raise UsageError(f"--size {size}: each side is from 64 to 4096 pixels, and even for an .mp4") from None
-        _fetch(client, run, Spec(**_common(run, "render"), render=section), output)
+        _make(client, run, Spec(**_common(run, "render"), render=section), output, as_json)
 
 
-def refuse_existing(path: Path, overwrite: bool) -> None:
-    """Raises UsageError for an existing file without --overwrite."""
-    if path.exists() and not overwrite:
-        raise UsageError(f"-o {path}: it exists; --overwrite replaces it")
+def view(
+    source: Annotated[
+        str,
+        typer.Argument(
+            metavar="JOB | RUN[@ITERATION|@best|@latest] | FILE",
+            help="A training that runs on this machine; a checkpoint's policy; a recording (.mcap, .mcap.partial, .rrd).",
+        ),
+    ],
+    worlds: Annotated[int, typer.Option(min=1, max=16, help="Number of worlds to show of a JOB or RUN.")] = 4,
+    episodes: Annotated[
+        int | None, typer.Option(min=1, help="For a RUN: end after this many episodes of each world.")
+    ] = None,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=1, max=65535, help="Port of the page and its stream; by default the first free one of 9090 to 9099."
+        ),
+    ] = None,
+    browser: Annotated[
+        bool | None,
+        typer.Option("--browser/--no-browser", help="Open the page; by default only with a terminal and a display."),
+    ] = None,
+    memory: Annotated[
+        str, typer.Option(help="Memory for data of pages opened later, such as 1GB; beyond it the oldest data goes.")
+    ] = "256MB",
+    accept_changed_robot: options.AcceptOption = False,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
+) -> None:
+    """View a training, a checkpoint's policy or a recording in a browser.
+
+    The page shows the worlds in 3-D, the curve of the return, the reward terms and the log. It is Rerun's web viewer, on this machine's
+    loopback, and needs no internet access: pip install 'muster[viz]'.
+    """
+    if not re.fullmatch(r"[1-9][0-9]{0,5}(MB|GB)", memory):
+        raise UsageError(f"--memory {memory}: expected a number with MB or GB, such as 256MB")
+    arguments = ["--worlds", str(worlds), "--memory", memory]
+    arguments += ["--port", str(port)] if port is not None else []
+    arguments += ["--browser"] if (_has_display() if browser is None else browser) else []
+    if source.endswith(_FILES) or os.sep in source:
+        path = Path(source).absolute()
+        if not path.is_file():
+            raise UsageError(f"{source}: no such file")
+        if path.suffix not in _FILES:
+            raise UsageError(f"{source}: give a recording with the ending .mcap, .mcap.partial or .rrd")
+        if episodes is not None:
+            raise UsageError("--episodes: only the policy of a RUN takes it; a recording is shown whole")
+        raise typer.Exit(run_worker(_VIEWER, "--file", str(path), *arguments))
+    with controller(store, cpus) as connect:
+        client = connect()
+        run, live = source_of(client, source)
+        path = run["path"]
+        if not Path(path).is_dir():
+            raise ServerError(
+                f"run {run['run']} lies at {path}, which is not visible from this machine; run muster view on a machine with the store"
+            )
+        if live is not None:
+            if episodes is not None:
+                raise UsageError(
+                    f"--episodes: {source} is training; to see its newest policy: muster view {run['run']}"
+                )
+            raise typer.Exit(run_worker(_VIEWER, "--training", path, "--job", live, *arguments, run=path))
+        arguments += ["--checkpoint", str(checkpoint_of(client, run, source))]
+        arguments += ["--episodes", str(episodes)] if episodes is not None else []
+        arguments += ["--accept-changed-robot"] if accept_changed_robot else []
+        raise typer.Exit(run_worker(_VIEWER, "--policy", path, *arguments, run=path))
 
 
-def check_output(path: Path, overwrite: bool, *endings: str) -> None:
-    """Refuse an output that can't be written before anything runs. Raises UsageError."""
-    if path.is_dir():
-        raise UsageError(f"-o {path}: it is a directory; name a file in it, such as {path / ('policy' + endings[0])}")
-    if path.suffix not in endings:
-        raise UsageError(f"-o {path}: unknown ending; use one of {', '.join(endings)}")
-    above = path.absolute().parent
-    if not above.is_dir():
-        raise UsageError(f"-o {path}: there is no directory {above}; create it first")
-    if not os.access(above, os.W_OK):
-        raise UsageError(f"-o {path}: {above} can't be written to; choose another directory")
-    refuse_existing(path, overwrite)
-    cut = path.with_name(f"{path.name}.partial")
-    if path.suffix == ".mcap" and cut.exists() and not overwrite:
-        raise UsageError(
-            f"-o {path}: {cut.name} exists, a recording that was cut short, or one that is being made; muster record --recover {cut} "
-            "saves it, --overwrite replaces it"
-        )
+def _has_display() -> bool:
+    """Whether a user would see an opened browser."""
+    has = os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or sys.platform == "darwin"
+    return bool(has) and sys.stdout.isatty() and not os.environ.get("SSH_CONNECTION")
 
 
 def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
-    """The run that is meant, and the job where one that is training now is meant. Raises ApiError, UsageError."""
-    name = split_reference(source)[0]
+    """The run of a reference, and the job if that is training now. Raises ApiError, UsageError."""
+    name = options.split_reference(source)[0]
     try:
         return client.get(f"/api/runs/{named(name)}"), None
     except ApiError as error:
@@ -164,16 +208,16 @@ def source_of(client: Client, source: str) -> tuple[dict[str, Any], str | None]:
         except ApiError as other:
             raise (error if other.status == 404 else other) from None
     run: dict[str, Any] = detail["results"] or {}
-    if detail["status"] in _RUNNING and detail["kind"] == "train" and "@" not in source:
+    if detail["status"] in ("STARTING", "RUNNING") and detail["kind"] == "train" and "@" not in source:
         return run, detail["id"]
     if not run.get("checkpoints"):
-        raise UsageError(f"job {name} is {detail['status']} and its run has no checkpoint yet; there is nothing to see")
+        raise UsageError(f"job {name} is {detail['status']} and its run has no checkpoint yet")
     return run, None
 
 
 def checkpoint_of(client: Client, run: dict[str, Any], source: str) -> int:
-    """The iteration of the requested checkpoint. Raises UsageError where there is none."""
-    iteration: int = chosen(client, run["run"], split_reference(source)[1])["iteration"]
+    """The iteration of the referenced checkpoint. Raises UsageError if it does not exist."""
+    iteration: int = chosen(client, run["run"], options.split_reference(source)[1])["iteration"]
     return iteration
 
 
@@ -181,45 +225,50 @@ def _common(run: dict[str, Any], kind: str) -> dict[str, Any]:
     """The parts of a job's spec that come from the training: queue, image, environment."""
     spec = run.get("spec") or {}
     kept = {key: spec[key] for key in ("queue", "image", "environment") if spec.get(key)}
-    memory = (spec.get("resources") or {}).get("memory", 2048)
-    cpus = min(1.0, (spec.get("resources") or {}).get("cpus", 1.0))
-    resources = Resources(cpus=cpus, memory=max(memory, 2048))
+    trained = spec.get("resources") or {}
+    resources = Resources(cpus=min(1.0, trained.get("cpus", 1.0)), memory=max(trained.get("memory", 2048), 2048))
     return {"name": f"{run['run'][:100]}-{kind}", "resources": resources, "retry": Retry(attempts=1), **kept}
 
 
-def _fetch(client: Client, run: dict[str, Any], spec: Spec, output: Path) -> None:
+def _make(client: Client, run: dict[str, Any], spec: Spec, output: Path, as_json: bool) -> None:
     """Run the job and bring its file to ``output``. Raises typer.Exit, ServerError."""
     job = submit_spec(client, spec, spec.name)["jobId"]
-    with Activity() as told:
-        told.wait(client, job)
+    with Activity() as activity:
+        activity.wait(client, job)
         for line in client.logs(job, follow=True):
             if line["rank"] is None:
                 continue
             if line["text"].startswith(("recorded: ", "rendered: ")):
-                told.end()
-                echo(line["text"])
+                activity.end()
+                echo(line["text"], err=as_json)
             elif line["text"].startswith(("loading ", "recording: ", "rendering: ", "compiling ")):
-                told.show(line["text"])
+                activity.show(line["text"])
     detail = client.get(f"/api/jobs/{job}")
     if detail["status"] != "SUCCEEDED":
         raise ServerError(f"{spec.name} failed: {detail['statusReason']}")
     made = list((Path(run["path"]) / "recordings").glob(f"*-{job[:8]}{output.suffix}"))
-    if not made:
-        echo(
-            f"made in the run's directory {run['path']}/recordings, which can't be seen from this machine: *-{job[:8]}{output.suffix}"
-        )
-        return
-    hidden = output.with_name(f".{output.name}.{job[:8]}.tmp")
+    facts = {"run": run["run"], "jobId": job, "path": str(output) if made else None}
+    if made:
+        _move(made[0], output)
+    if as_json:
+        echo_json(facts)
+    elif made:
+        echo(f"written: {output}")
+    else:
+        place = f"{run['path']}/recordings"
+        echo(f"made in the run's directory {place}, which can't be seen from this machine: *-{job[:8]}{output.suffix}")
+
+
+def _move(made: Path, output: Path) -> None:
+    """Move a file to another volume, where it appears whole. Raises ServerError."""
+    hidden = output.with_name(f".{output.name}.{made.stem[-8:]}.tmp")
     try:
-        shutil.copyfile(made[0], hidden)
+        shutil.copyfile(made, hidden)
         os.replace(hidden, output)
-        made[0].unlink(missing_ok=True)
+        made.unlink(missing_ok=True)
     except OSError as error:
         hidden.unlink(missing_ok=True)
-        raise ServerError(
-            f"-o {output}: it can't be written ({error.strerror or error}); it lies at {made[0]}"
-        ) from None
-    echo(f"written: {output}")
+        raise ServerError(f"-o {output}: it can't be written ({error.strerror or error}); it lies at {made}") from None
 
 
 def run_worker(module: str, *arguments: str, run: str = "") -> int:

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
-from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.recordings import check_output
+from orchestrator.cli.command_options import JsonOption, OverwriteOption
+from orchestrator.cli.listings import Cell, Resource, number
+from orchestrator.cli.outputs import check_output
 from orchestrator.cli.tasks import ask_worker
-from orchestrator.cli.terminal import echo, echo_json, print_cut, print_wrapped
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import SpecError
 from shared_store.contract.error_text import counted
 
@@ -36,33 +34,23 @@ def robot(
     ] = False,
     output: Annotated[
         Path | None,
-        typer.Option("--output", "-o", help="Draw its default pose into this PNG file.", show_default=False),
+        typer.Option("--output", "-o", help="Draw its default pose into this PNG file."),
     ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+    overwrite: OverwriteOption = False,
     fixed: Annotated[
         bool | None,
-        typer.Option(
-            "--fixed/--no-fixed",
-            help="Fix its root to the world, or let it move; else as in the file.",
-            show_default=False,
-        ),
+        typer.Option("--fixed/--no-fixed", help="Fix its root to the world, or let it move; else as in the file."),
     ] = None,
     ignore: Annotated[
         list[str] | None,
         typer.Option(
-            "--ignore",
-            metavar="PATTERN",
-            help="Leave out these bodies and geoms (repeatable); else floor and ground.",
-            show_default=False,
+            "--ignore", metavar="PATTERN", help="Leave out these bodies and geoms (repeatable); else floor and ground."
         ),
     ] = None,
     accept: Annotated[
         list[str] | None,
         typer.Option(
-            "--accept",
-            metavar="PATTERN",
-            help='Accept these differences from the file, "ELEMENT: VALUE" (repeatable).',
-            show_default=False,
+            "--accept", metavar="PATTERN", help='Accept these differences from the file, "ELEMENT: VALUE" (repeatable).'
         ),
     ] = None,
     as_json: JsonOption = False,
@@ -75,12 +63,10 @@ def robot(
     """
     if output is not None:
         check_output(output, overwrite, ".png")
-    if sys.stderr.isatty():
-        echo("importing the simulation, which takes some seconds …", err=True)
     arguments = ["--picture", str(output)] if output else []
     arguments += [] if fixed is None else ["--fixed" if fixed else "--no-fixed"]
     arguments += [
-        f"--{name}={each}" for name, given in (("ignore", ignore), ("accept", accept)) for each in given or ()
+        f"--{name}={each}" for name, patterns in (("ignore", ignore), ("accept", accept)) for each in patterns or ()
     ]
     found: dict[str, Any] = ask_worker("worker.robot", [*arguments, "--", file], f"{file} can't be shown")
     if as_json:
@@ -93,65 +79,68 @@ def robot(
     _print(found, compare)
 
 
+def _numbers(*names: str, **keys: str) -> dict[str, Cell]:
+    """Columns of numbers: by name, or by heading and key."""
+    columns = {name.upper(): name for name in names} | keys
+    return {heading: partial(_number, key) for heading, key in columns.items()}
+
+
+def _number(key: str, row: dict[str, Any]) -> str:
+    return number(row[key], ".4g")
+
+
+def _range(lower: float | None, upper: float | None) -> str:
+    if lower is None and upper is None:
+        return ""
+    return " to ".join(number(each, ".4g") or "-" for each in (lower, upper))
+
+
+def _limits(row: dict[str, Any]) -> str:
+    return _range(row["lower"], row["upper"])
+
+
+def _connects(row: dict[str, Any]) -> str:
+    return ", ".join(row["connects"])
+
+
+_TABLES: dict[str, dict[str, Cell]] = {
+    "JOINTS": {
+        "NAME": "name",
+        "KIND": "kind",
+        "LIMITS [rad, m]": _limits,
+        **_numbers("default", "stiffness", "damping", "armature", EFFORT="effort_limit"),
+    },
+    "BODIES": {"NAME": "name", "MASS [kg]": lambda each: f"{each['mass']:.6g}"},
+    "ACTUATORS": {
+        "NAME": "name",
+        "DRIVES": "drives",
+        **_numbers("gear", "gain", "stiffness", "damping"),
+        "CONTROL": lambda each: _range(*each["control_range"] or (None, None)),
+        "FORCE": lambda each: _range(*each["force_range"] or (None, None)),
+        "DYNAMICS": "dynamics",
+    },
+    "TENDONS": {
+        "NAME": "name",
+        "LIMITS [rad, m]": _limits,
+        **_numbers("stiffness", "damping"),
+        "CONNECTS": _connects,
+    },
+    "EQUALITIES": {
+        "NAME": "name",
+        "KIND": lambda each: each["kind"] if each["active"] else f"{each['kind']}, off",
+        "CONNECTS": _connects,
+    },
+    "SENSORS of the file (tasks declare sensors themselves)": {"NAME": "name", "KIND": "kind"},
+}
+"""By title, which begins with the key of the robot's parts."""
+
+
 def _print(found: dict[str, Any], compare: bool) -> None:
     root = "no free root" if found["fixed"] else "a free root"
     counts = f"{counted(len(found['bodies']), 'body', 'bodies')}, {counted(len(found['joints']), 'joint')}"
     echo(f"{found['file']}: {found['mass']:g} kg, {counts}, {root}")
-    _table(
-        "JOINTS",
-        ("NAME", "KIND", "LIMITS [rad, m]", "DEFAULT", "STIFFNESS", "DAMPING", "ARMATURE", "EFFORT"),
-        [
-            (
-                each["name"],
-                each["kind"],
-                _range(each["lower"], each["upper"]),
-                *(_number(each[name]) for name in ("default", "stiffness", "damping", "armature", "effort_limit")),
-            )
-            for each in found["joints"]
-        ],
-    )
-    _table("BODIES", ("NAME", "MASS [kg]"), [(each["name"], f"{each['mass']:.6g}") for each in found["bodies"]])
-    _table(
-        "ACTUATORS",
-        ("NAME", "DRIVES", "GEAR", "GAIN", "STIFFNESS", "DAMPING", "CONTROL", "FORCE", "DYNAMICS"),
-        [
-            (
-                each["name"],
-                each["drives"],
-                *(_number(each[name]) for name in ("gear", "gain", "stiffness", "damping")),
-                *("" if each[name] is None else _range(*each[name]) for name in ("control_range", "force_range")),
-                each["dynamics"],
-            )
-            for each in found["actuators"]
-        ],
-    )
-    _table(
-        "TENDONS",
-        ("NAME", "LIMITS [rad, m]", "STIFFNESS", "DAMPING", "CONNECTS"),
-        [
-            (
-                each["name"],
-                _range(each["lower"], each["upper"]),
-                _number(each["stiffness"]),
-                _number(each["damping"]),
-                ", ".join(each["connects"]),
-            )
-            for each in found["tendons"]
-        ],
-    )
-    _table(
-        "EQUALITIES",
-        ("NAME", "KIND", "CONNECTS"),
-        [
-            (each["name"], each["kind"] if each["active"] else f"{each['kind']}, off", ", ".join(each["connects"]))
-            for each in found["equalities"]
-        ],
-    )
-    _table(
-        "SENSORS of the file (tasks declare sensors themselves)",
-        ("NAME", "KIND"),
-        [(each["name"], each["kind"]) for each in found["sensors"]],
-    )
+    for title, columns in _TABLES.items():
+        Resource(columns, title=title, blank="").show(found[title.partition(" ")[0].lower()])
     if found["corrected"] and not compare:
         first = found["corrected"][0]
         what = f"{counted(len(found['corrected']), 'value')} that Newton's importer reads otherwise, such as {first['field']} of {first['element']}"
@@ -167,34 +156,6 @@ def _print(found: dict[str, Any], compare: bool) -> None:
 
 
 def _print_differences(title: str, differences: list[dict[str, str]]) -> None:
-    if not differences:
-        echo(f"\n{title}: nothing; Newton's importer reads the robot that its file says")
-        return
-    rows = [(each["element"], each["field"], each["here"], each["file"]) for each in differences]
-    _table(title, ("ELEMENT", "VALUE", "NEWTON", "FILE"), rows, fold=True)
-
-
-def _number(value: float | None) -> str:
-    return "" if value is None else f"{value:.4g}"
-
-
-def _range(lower: float | None, upper: float | None) -> str:
-    if lower is None and upper is None:
-        return ""
-    return " to ".join("-" if each is None else f"{each:.4g}" for each in (lower, upper))
-
-
-def _table(title: str, columns: tuple[str, ...], rows: Sequence[tuple[str, ...]], fold: bool = False) -> None:
-    """``fold``: long cells take several lines, and nothing is cut."""
-    if not rows:
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in columns:
-        table.add_column(Text(column), overflow="fold", no_wrap=not fold)
-    for row in rows:
-        table.add_row(*row)
-    echo(f"\n{title}")
-    if fold:
-        print_wrapped(table)
-    else:
-        print_cut(table)
+    columns = {"ELEMENT": "element", "VALUE": "field", "NEWTON": "here", "FILE": "file"}
+    empty = f"\n{title}: nothing; Newton's importer reads the robot that its file says"
+    Resource(columns, empty, title=title, blank="", folded=columns).show(differences)

@@ -1,86 +1,144 @@
-"""Commands for runs: ``muster resume`` and ``muster checkpoints``."""
+"""``muster runs`` and ``muster checkpoints``: what the store has."""
 
 from __future__ import annotations
 
-import os
-import time
-from functools import partial
+import sys
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from orchestrator.cli.jobs import AcceptOption, JsonOption, SetOption, engine_queue, on_queue, store_of, tell_note
-from orchestrator.cli.progress import await_end, follow
-from orchestrator.cli.serving import CpusOption, StoreOption, found_or_own, see_through
-from orchestrator.cli.show import scored
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.command_options import JsonOption, RunArgument, YesOption
+from orchestrator.cli.listings import Resource, date, date_ms, mebibytes, number, scored
+from orchestrator.cli.misuse import make_group
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
-from orchestrator.spec.kept_files import changes_with_files
+from orchestrator.domain.errors import UsageError
+from shared_store.contract.error_text import counted
 
-RunArgument = Annotated[str, typer.Argument(help="A run; `muster show JOB` prints its name.")]
+_A_PAGE = 100
+
+
+def _train(run: dict[str, Any]) -> dict[str, Any]:
+    return (run["spec"] or {}).get("train") or {}
+
+
+def _last_job(run: dict[str, Any]) -> dict[str, Any]:
+    return run["jobs"][-1] if run["jobs"] else {}
+
+
+RUNS = Resource(
+    {
+        "RUN": "run",
+        "TASK": lambda run: _train(run).get("task"),
+        "ITERATION": lambda run: f"{run['iteration']}/{_train(run).get('iterations', '?')}" if _train(run) else "",
+        "CHECKPOINTS": lambda run: run["checkpoints"],
+        "NEWEST": lambda run: Path(run["checkpoint"] or "").name,
+        "LAST JOB": lambda run: _last_job(run).get("id", "")[:8],
+        "STATE": lambda run: _last_job(run).get("status"),
+        "OWNER": lambda run: run["owner"],
+        "QUEUE": "queue",
+        "CREATED": lambda run: date_ms(run["created"]),
+    },
+    route="/api/runs",
+)
+CHECKPOINTS = Resource(
+    {
+        "CHECKPOINT": "name",
+        "ITERATION": "iteration",
+        "REWARD": lambda each: number(each.get("reward")),
+        "SCORE": lambda each: scored(each.get("score"), each.get("scoreError")),
+        "EVALUATED": lambda each: _evaluated(each["evaluated"]),
+        "WORLDS": "worlds",
+        "SIZE": lambda each: mebibytes(each.get("size")),
+        "CREATED": lambda each: date(each.get("created")),
+        "STATE": lambda each: _state(each) + (", the best" if each["best"] else ""),
+    }
+)
 
 
 def register(app: typer.Typer) -> None:
-    app.command(epilog="Example:  muster resume ant-1f2e3d4c --set train.iterations=600 -f")(resume)
+    group = make_group(
+        "List, archive and delete the runs of the store.\n\nOld runs that hold nothing but logs go by themselves, as `muster gc --help` says.",
+        "Examples:  muster runs --search ant   then   muster runs archive ant-1f2e3d4c",
+        list_runs,
+    )
+    group.command("list", epilog="Example:  muster runs list --search ant")(list_runs)
+    group.command(epilog="Examples:  muster runs archive ant-1f2e3d4c   and   muster runs archive ant-1f2e3d4c --undo")(
+        archive
+    )
+    group.command(epilog="Example:  muster runs delete ant-1f2e3d4c --yes")(delete)
+    app.add_typer(group, name="runs")
     app.command(epilog="Example:  muster checkpoints ant-1f2e3d4c --verify")(checkpoints)
 
 
-def resume(
-    run: RunArgument,
-    checkpoint: Annotated[int | None, typer.Option(help="Resume from this iteration instead of the newest.")] = None,
-    nodes: Annotated[
-        int | None, typer.Option(min=1, help="Number of nodes, if it should change; the worlds are resharded.")
-    ] = None,
-    set_: SetOption = None,
-    accept_changed_robot: AcceptOption = False,
-    engine: Annotated[str | None, typer.Option(help="Engine that runs the job, one of the controller's.")] = None,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
-    follow_: Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")] = False,
+def list_runs(
+    search: Annotated[str, typer.Option(help="Part of the name.")] = "",
+    archived: Annotated[bool, typer.Option("--archived", help="List the archived runs instead.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Resume a run from its newest checkpoint, at the next iteration.
+    """List the runs that you may see, by name, each with its newest checkpoint and its last job."""
+    with Client.connect() as client:
+        found = all_runs(client, search=search, archived=str(archived).lower())
+    RUNS.show(found, as_json)
+    if not found and not as_json:
+        echo("no run is archived" if archived else "no run; `muster runs --archived` lists archived ones")
 
-    Where no controller is running, this command is one until the job ends, as `muster run` is: it shows the progress, and Ctrl-C stops the
-    job after a checkpoint. --store and --cpus are for this case.
+
+def all_runs(client: Client, **query: Any) -> list[dict[str, Any]]:
+    """The runs that the caller may see, page by page. Raises ApiError, Unreachable."""
+    found: list[dict[str, Any]] = []
+    page = found
+    while page is found or len(page) == _A_PAGE:
+        after = found[-1]["run"] if found else ""
+        page = client.get("/api/runs", after=after, max=_A_PAGE, seconds=610, **query)
+        found = [*found, *page]
+    return found
+
+
+def archive(
+    run: RunArgument,
+    undo: Annotated[bool, typer.Option("--undo", help="Take the run out of the archive.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Archive a run: it is kept, with its jobs and logs, until it is taken out again.
+
+    Nothing is added to it meanwhile (no job continues or evaluates it), and `muster runs` lists it with --archived only. Its weights
+    can be cloned and imitated as before.
     """
-    with found_or_own(store, cpus, [engine] if engine else ()) as (client, is_own):
-        elsewhere = on_queue(set_, None if engine is None else engine_queue(client, engine))
-        accepted = ["train.accept_changed_robot=true"] if accept_changed_robot else []
-        body = {
-            "checkpoint": checkpoint,
-            "nodes": nodes,
-            "set": [
-                *changes_with_files(
-                    lambda: client.get(f"/api/runs/{named(run)}")["spec"],
-                    set_,
-                    client.keep_text,
-                    partial(store_of, client),
-                    tell_note,
-                    partial(client.run_text, run),
-                ),
-                *elsewhere,
-                *accepted,
-            ],
-            "directory": os.getcwd(),
-        }
-        resumed = client.post(f"/api/runs/{named(run)}/resume", body, once=True)
-        if as_json:
-            echo_json(resumed)
-        else:
-            at = f" from iteration {resumed['iteration']}" if resumed["kind"] == "train" else ""
-            echo(f"resumed {resumed['run']}{at} as job {resumed['jobId']}")
-            if not follow_ and not is_own:
-                echo(f"follow it with: muster logs {resumed['jobId'][:8]} -f")
-        code = None
-        if is_own:
-            echo("no other controller is running: this command is the controller until the job ends", err=True)
-            code = see_through(client, resumed["jobId"], await_end if as_json else follow)
-        elif follow_:
-            code = (await_end if as_json else follow)(client, resumed["jobId"])
-    if code is not None:
-        raise typer.Exit(code)
+    with Client.connect() as client:
+        archived = client.post(f"/api/runs/{named(run)}/archive", {"archived": not undo})
+    if as_json:
+        echo_json(archived)
+    else:
+        echo(f"run {run} is {'no longer archived' if undo else 'archived: it is neither continued nor deleted'}")
+
+
+def delete(run: RunArgument, yes: YesOption = False, as_json: JsonOption = False) -> None:
+    """Delete a run with its checkpoints, logs and results, for good.
+
+    It is refused while something needs the run: an unfinished job, a clone, a pupil, a model, or what a plug-in keeps, such as an entry of
+    a league. The jobs of the run stay in the history.
+    """
+    with Client.connect() as client:
+        if not yes:
+            _confirm(client, run)
+        deleted = client.delete(f"/api/runs/{named(run)}", seconds=610)
+    if as_json:
+        echo_json(deleted)
+        return
+    echo(f"deleted run {run}: {counted(deleted['files'], 'file')}, {mebibytes(deleted['bytes'])}")
+    if left := deleted["left"]:
+        echo(f"not all of them can be removed; remove the rest by hand: {left}")
+
+
+def _confirm(client: Client, run: str) -> None:
+    """Raises typer.Abort if the user does not confirm, UsageError where nobody can answer."""
+    if not sys.stdin.isatty():
+        raise UsageError(f"run {run} is not deleted: add --yes where nobody can answer")
+    found = client.get(f"/api/runs/{named(run)}")
+    what = f"{counted(found['checkpoints'], 'checkpoint')} and everything else in it"
+    typer.confirm(f"delete run {run} with {what} for good?", abort=True)
 
 
 def checkpoints(
@@ -91,38 +149,42 @@ def checkpoints(
     """List a run's checkpoints; with --verify, exit 1 if one is damaged."""
     with Client.connect() as client:
         found = client.get(f"/api/runs/{named(run)}/checkpoints", verify=verify)
-    damaged = [each for each in found if each.get("problem")]
-    if as_json:
-        echo_json(found, indent=1)
-    elif not found:
+    CHECKPOINTS.show(found, as_json)
+    if not found and not as_json:
         echo(f"run {run} has no checkpoint yet")
-    else:
-        table = Table(box=None, pad_edge=False)
-        for column in ("CHECKPOINT", "ITERATION", "REWARD", "SCORE", "EVALUATED", "WORLDS", "SIZE", "CREATED", "STATE"):
-            table.add_column(column, no_wrap=True)
-        for each in found:
-            reward = "-" if each.get("reward") is None else f"{each['reward']:.2f}"
-            score = scored(each.get("score"), each.get("scoreError"))
-            size = f"{each['size'] / 2**20:.1f} MiB" if "size" in each else "-"
-            created = (
-                time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(each["created"])) if each.get("created") else "-"
-            )
-            state = each.get("problem") or ("verified" if each.get("verified") else "committed")
-            if each["best"]:
-                state += ", the best"
-            table.add_row(
-                *(each["name"], str(each["iteration"]), reward, score, _evaluated(each["evaluated"])),
-                *(str(each.get("worlds", "-")), size, created, state),
-            )
-        print_cut(table)
-    if damaged:
+    if any(each.get("problem") for each in found):
         raise typer.Exit(1)
 
 
-def _evaluated(told: dict[str, Any] | None) -> str:
+def _state(checkpoint: dict[str, Any]) -> str:
+    return checkpoint.get("problem") or ("verified" if checkpoint.get("verified") else "committed")
+
+
+def _evaluated(summary: dict[str, Any] | None) -> str:
     """The mean return of an evaluation, with half of its 95 % interval."""
-    if told is None:
-        return "-"
-    if not isinstance(told["high"], int | float):
-        return f"{told['mean']:.2f}"
-    return f"{told['mean']:.2f} ± {told['high'] - told['mean']:.2f}"
+    if summary is None:
+        return ""
+    high = summary["high"]
+    return scored(summary["mean"], high - summary["mean"] if isinstance(high, int | float) else None)
+
+
+def chosen(client: Client, run: str, reference: int | str | None) -> dict[str, Any]:
+    """The API's description of the referenced checkpoint. Raises UsageError with the nearest one."""
+    found: list[dict[str, Any]] = client.get(f"/api/runs/{named(run)}/checkpoints")
+    if not found:
+        raise UsageError(f"run {run} has no checkpoint yet; train it first")
+    if reference in (None, "latest"):
+        return found[-1]
+    if reference == "best":
+        best = next((each for each in found if each["best"]), None)
+        if best is None:
+            raise UsageError(f"run {run} has no checkpoint with a score or two evaluations yet; name an iteration")
+        return best
+    fitting = [each for each in found if each["iteration"] == reference]
+    if not fitting:
+        iterations = [str(each["iteration"]) for each in found]
+        near = min(found, key=lambda each: abs(each["iteration"] - int(reference)))["iteration"]
+        raise UsageError(
+            f"run {run} has no checkpoint of iteration {reference}; the nearest is {near}; it has: {', '.join(iterations)}"
+        )
+    return fitting[-1]

@@ -2,55 +2,38 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import socket
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from math import inf
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from orchestrator.cli.jobs import (
-    SetOption,
-    SpecArgument,
-    check_engine,
-    on_engine,
-    store_here,
-    submit_spec,
-    tell,
-    tell_note,
-)
-from orchestrator.cli.progress import follow
-from orchestrator.cli.terminal import echo
-from orchestrator.client import Client
+from orchestrator.cli import command_options as options
+from orchestrator.cli.controllers import controller
+from orchestrator.cli.progress import outcome
+from orchestrator.cli.submitting import carry_out, load_spec, note, on_engine, store_here
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.control.disk import DEFAULT, MinFree
-from orchestrator.domain.errors import NotServing, ServerError, SpecError, Unreachable, UsageError
+from orchestrator.domain.errors import SpecError, UsageError
 from orchestrator.domain.retention import rule_of
 from orchestrator.engines.toolkit.environment import INHERIT, PRIVATE
-from orchestrator.home import ControllerRuns, local_url, muster_home
-from orchestrator.spec import file as specfile
+from orchestrator.home import muster_home
 from orchestrator.spec.values import seconds_of
 
-StoreOption = Annotated[str | None, typer.Option(help="Directory of the shared store; $MUSTER_HOME/store by default.")]
-EngineOption = Annotated[
+EnginesOption = Annotated[
     list[str] | None,
     typer.Option(
+        "--engine",
+        metavar="ENGINE",
         help="Engine that runs the nodes: local (the default: processes on this machine), docker (containers of the job's image), ray, "
-        "slurm or aws-batch. Repeatable: the first gets the queue default, each other one a queue that has its name. An engine whose jobs in the "
-        "queue default are not over keeps it."
+        "slurm or aws-batch. Repeatable: the first gets the queue default, each other one a queue that has its name. An engine with "
+        "unfinished jobs in the queue default keeps it.",
     ),
 ]
-_SHORTEST_SILENCE = 10.0
-_SHORTEST_INTERVAL, _LONGEST_INTERVAL = 1.0, 240.0
-"""Seconds between two calls of squeue: slurmctld forgets an ended job after 300 s by default (MinJobAge)."""
-CpusOption = Annotated[
-    float | None, typer.Option(min=0.1, help="CPU cores to allocate; by default all of the machine's.")
-]
-
 InheritOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -58,10 +41,12 @@ InheritOption = Annotated[
         metavar="NAME",
         envvar=INHERIT,
         help="Variable that jobs get, too, such as WANDB_API_KEY: of this environment (local, slurm), of the node's (ray). Repeatable.",
-        show_default=False,
         show_envvar=False,
     ),
 ]
+_SHORTEST_SILENCE = 10.0
+_SHORTEST_INTERVAL, _LONGEST_INTERVAL = 1.0, 240.0
+"""Seconds between two calls of squeue: slurmctld forgets an ended job after 300 s by default (MinJobAge)."""
 
 
 def register(app: typer.Typer) -> None:
@@ -70,30 +55,35 @@ def register(app: typer.Typer) -> None:
 
 
 def run(
-    spec: SpecArgument,
-    set_: SetOption = None,
-    store: StoreOption = None,
-    cpus: CpusOption = None,
-    engine: EngineOption = None,
+    spec: options.SpecArgument,
+    set_: options.SetOption = None,
+    name: options.NameOption = None,
+    queue: options.QueueOption = None,
+    engine: EnginesOption = None,
+    nodes: options.NodesOption = None,
+    store: options.StoreOption = None,
+    cpus: options.CpusOption = None,
     inherit: InheritOption = None,
+    follow_: options.DetachOption = True,
+    dry_run: options.DryRunOption = False,
+    as_json: options.JsonOption = False,
 ) -> None:
-    """Run a job to its end, with a temporary controller if none is running; exit with its result.
+    """Run a job to its end, with a temporary controller if none is running.
 
-    Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
+    It exits with the job's result. Ctrl-C stops the job after a checkpoint; a second Ctrl-C leaves it running.
     """
-    loaded = specfile.load(spec, set_, lambda: store_here(store))
-    tell(loaded)
+    loaded = load_spec(spec, set_, name, queue, nodes, lambda: store_here(store))
     have_inherited(inherit)
-    for name in engine or ():
-        check_engine(name)
+    for each in engine or ():
+        options.check_engine(each)
     with controller(store, cpus, engine or ()) as connect:
         client = connect()
         if inherit and (client.found or os.environ.get("MUSTER_URL")):
-            tell_note(f"--inherit: the controller at {client.url} runs already; its own --inherit says what jobs get")
-        if engine:
-            loaded = on_engine(client, loaded, engine[0], spec)
-        job = submit_spec(client, loaded, spec)["jobId"]
-        code = see_through(client, job)
+            note(f"--inherit: the controller at {client.url} runs already; its own --inherit says what jobs get")
+        loaded = on_engine(client, loaded, engine[0] if engine else None, spec)
+        code, job = carry_out(client, loaded, spec, follows=follow_, dry_run=dry_run, as_json=as_json)
+        if as_json and job:
+            echo_json(outcome(client.get(f"/api/jobs/{job}")), indent=1)
     raise typer.Exit(code)
 
 
@@ -111,126 +101,90 @@ def have_inherited(names: Sequence[str] | None) -> None:
     os.environ[INHERIT] = " ".join(names or ())
 
 
-def see_through(client: Client, job: str, follow: Callable[[Client, str], int] = follow) -> int:
-    """Follow a job to its end; Ctrl-C and SIGTERM stop it after a checkpoint. Returns the command's exit code."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        return follow(client, job)
-    except KeyboardInterrupt:
-        echo("\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)", err=True)
-        client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")
-        follow(client, job)
-        return 130
-
-
 def serve(
     host: Annotated[
         str, typer.Option(help="Address to listen on; any but loopback requires a key (muster keys) or MUSTER_TOKEN.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0: any free port.")] = 8080,
-    store: StoreOption = None,
+    store: options.StoreOption = None,
     adopt_store: Annotated[
         bool,
-        typer.Option(
-            "--adopt-store",
-            help="Take what is at the store's path as the store of this controller, which knows another one.",
-        ),
+        typer.Option("--adopt-store", help="Use the store at this path although the controller knows another one."),
     ] = False,
-    cpus: CpusOption = None,
-    engine: EngineOption = None,
-    database: Annotated[
-        str | None,
-        typer.Option(
-            envvar="MUSTER_DATABASE",
-            help="postgresql+psycopg://USER@HOST/NAME, or path of an SQLite file on a local disk; $MUSTER_HOME/muster.db by default.",
-        ),
-    ] = None,
+    cpus: options.CpusOption = None,
+    engine: EnginesOption = None,
+    database: options.DatabaseOption = None,
     retention: Annotated[
         str | None,
         typer.Option(
-            help="Time to keep ended jobs, their logs, and runs that hold nothing else, such as 90d; off: without end. By "
-            "default jobs of the Batch API are kept for 90d, others without end; the tag muster:retention of a queue takes precedence.",
-            show_default=False,
+            help="Time to keep ended jobs, their logs, and runs that hold nothing else, such as 90d; off: without end. By default 90d for "
+            "jobs of the Batch API, without end for others; a queue's tag muster:retention takes precedence."
         ),
     ] = None,
     min_free: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="Free space on the volumes of the store and the database below which no gang starts, such as 1GiB or 5%; 0: "
-            "no limit. By default 1GiB, or 5% of a small volume.",
-            show_default=False,
+            help="Free space of store and database below which no gang starts: 1GiB or 5%; 0: no limit. By default 1GiB, or 5% of a "
+            "small volume."
         ),
-    ] = "",
+    ] = None,
     lost_after: Annotated[
         str,
         typer.Option(
-            help="Time after which a node that alone is silent on the bus is lost, such as 5m, while its engine answers and says that "
-            "it runs. The controller waits for nodes that fall silent together, since it may itself be cut off."
+            help="Time after which a node is lost that alone is silent on the bus, such as 5m, while its engine says that it runs. Nodes "
+            "that fall silent together are waited for, since the controller may be cut off."
         ),
     ] = "120s",
     squeue_interval: Annotated[
         str | None,
         typer.Option(
-            help="Time between two calls of squeue by the slurm engine, such as 60s. By default 1s with at most 10 gangs in Slurm's "
-            "queue, and 30s with more.",
-            show_default=False,
+            help="Time between two calls of squeue, such as 60s. By default 1s with at most 10 gangs, else 30s."
         ),
     ] = None,
     rate_limit: Annotated[
-        int,
-        typer.Option(min=0, help="Requests per second of each key, with bursts of twice as many; 0: unlimited."),
+        int, typer.Option(min=0, help="Requests per second of each key, with bursts of twice as many; 0: unlimited.")
     ] = 1000,
     trust_proxy: Annotated[
         list[str] | None,
         typer.Option(
-            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are trusted; repeatable. "
-            "None by default."
+            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are trusted. Repeatable."
         ),
     ] = None,
     submit_rate_limit: Annotated[
-        int,
-        typer.Option(
-            min=0, help="Submissions (SubmitJob, POST /api/jobs) per second of each key (AWS: 50); 0: unlimited."
-        ),
+        int, typer.Option(min=0, help="Submissions per second of each key (AWS: 50); 0: unlimited.")
     ] = 0,
     secrets: Annotated[
         str | None,
         typer.Option(
-            help="Source of the secrets that job definitions name: a JSON file of names and values, or env for the variables "
-            "MUSTER_SECRET_<name>. Jobs that name secrets are refused by default."
+            help="Source of the secrets that jobs name: a JSON file of names and values, or env for variables MUSTER_SECRET_<name>. By "
+            "default such jobs are refused."
         ),
     ] = None,
     webhooks: Annotated[
         str | None,
-        typer.Option(
-            help="Send a message when jobs end: a JSON file of URLs and secrets, which replace those of the database; see `muster "
-            "webhooks --help`. By default the database's."
-        ),
+        typer.Option(help="JSON file of webhooks, which replaces those in the database; see `muster webhooks --help`."),
     ] = None,
     account_id: Annotated[
         str | None,
-        typer.Option(
-            help="AWS account in all ARNs, 12 digits; 000000000000 by default. The first `muster serve` settles it.",
-            show_default=False,
-        ),
+        typer.Option(help="AWS account in all ARNs, 12 digits. The first `muster serve` settles it; default: zeros."),
     ] = None,
     region: Annotated[
         str | None,
-        typer.Option(
-            help="AWS region in all ARNs; us-east-1 by default. The first `muster serve` settles it. Nothing runs there.",
-            show_default=False,
-        ),
+        typer.Option(help="AWS region in all ARNs. The first `muster serve` settles it; default: us-east-1."),
     ] = None,
     inherit: InheritOption = None,
 ) -> None:
-    """Run the controller as a server. Running jobs outlive it; the next controller finds them."""
+    """Run the controller as a server. Running jobs outlive it.
+
+    The next controller finds them.
+    """
     from orchestrator.server import Server  # imports dependencies of the controller only
     from orchestrator.service_manager import ServiceManager
 
     manager = ServiceManager()
     have_inherited(inherit)
     for name in engine or ():
-        check_engine(name)
+        options.check_engine(name)
     server = Server(
         muster_home(),
         host=host,
@@ -297,87 +251,11 @@ def _squeue_interval(text: str | None, engines: Sequence[str]) -> float | None:
     return seconds
 
 
-def _min_free(text: str) -> MinFree:
+def _min_free(text: str | None) -> MinFree:
     try:
         return MinFree.parse(text) if text else DEFAULT
     except ValueError as error:
         raise SpecError(f"--min-free {text}: {error}") from None
-
-
-@contextlib.contextmanager
-def controller(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[Callable[[], Client]]:
-    """A function that connects to the controller of this home directory, or starts one if none is running."""
-    with contextlib.ExitStack() as stack:
-
-        def connect() -> Client:
-            client = stack.enter_context(_controller(store, cpus, engines))
-            # a service comes back by itself, with its own options; none of this command's may take its place
-            client.successor = connect if client.is_temporary else None
-            return client
-
-        yield connect
-
-
-@contextlib.contextmanager
-def found_or_own(store: str | None, cpus: float | None, engines: Sequence[str] = ()) -> Iterator[tuple[Client, bool]]:
-    """A client of this home directory's controller, and whether this command started that, since none was running.
-
-    One is started only where there may be runs: with a given store, or in a home directory that a controller had. Raises Unreachable, ServerError.
-    """
-    is_own = not os.environ.get("MUSTER_URL") and local_url() is None
-    if is_own and store is None and not (muster_home() / "muster.db").is_file():
-        Client.connect()  # raises Unreachable, with what to do
-    if is_own and store is not None and not (Path(store).expanduser() / "store.json").is_file():
-        raise ServerError(
-            f"--store {store}: there is no store here (no store.json), so no run; name the store of the run"
-        )
-    with controller(store, cpus, engines) as connect:
-        client = connect()
-        yield client, is_own and not client.found  # else another one was starting
-
-
-@contextlib.contextmanager
-def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -> Iterator[Client]:
-    """A client of the controller that serves this home directory, or of a new one in this process."""
-    url = os.environ.get("MUSTER_URL") or local_url()
-    if url:
-        with contextlib.ExitStack() as stack:
-            try:
-                client = stack.enter_context(Client.connect(serving=True))
-                there = client.get("/api/capacity")["store"]
-            except NotServing:
-                raise
-            except Unreachable:
-                if os.environ.get("MUSTER_URL"):
-                    raise
-            else:
-                if store is not None and str(Path(store).expanduser().absolute()) != there:
-                    raise ServerError(
-                        f"--store {store}: the controller at {url} keeps {there}; leave --store out, or stop it"
-                    )
-                yield client
-                return
-    from orchestrator.server import Server
-
-    try:
-        server = Server(muster_home(), store=store, cpus=cpus, engines=engines or ("local",), temporary=True)
-    except ControllerRuns as error:
-        if local_url() not in (None, url):  # it was starting
-            with _controller(store, cpus, engines) as client:
-                yield client
-            return
-        if url is None:
-            raise
-        raise Unreachable(
-            f"the controller at {url} does not answer: it may be frozen or busy; its jobs run on"
-        ) from error
-    server.start()
-    try:
-        with Client(server.url, server.access.own_token) as client:  # it may require a key that this command lacks
-            client.is_temporary = True
-            yield client
-    finally:
-        server.close()
 
 
 def _retention(text: str | None) -> float | None:

@@ -10,11 +10,29 @@ from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption
-from orchestrator.cli.terminal import Console, echo, echo_json, print_wrapped
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource
+from orchestrator.cli.terminal import Console, echo
 from orchestrator.domain.errors import ServerError, SpecError
+
+TASKS = Resource(
+    {
+        "TASK": "name",
+        "OBSERVATIONS": lambda task: len(task["observations"]),
+        "ACTIONS": lambda task: len(task["actions"]),
+        "CONTROL": lambda task: f"{task['control_hz']:g} Hz",
+        "EPISODE": lambda task: f"{task['episode_seconds']:g} s",
+        "REWARDS": lambda task: "  ".join(f"{term} {weight:g}" for term, weight in task["rewards"].items()),
+    },
+    problem=("error", "can't be imported"),
+    folded=("REWARDS",),
+)
+NUMBERS = Resource(
+    {"": lambda row: row[0], " ": lambda row: ", ".join(f"{value:g}" for value in row[1])},
+    folded=(" ",),
+    title="NUMBERS of train.config.numbers and train.config.curriculum",
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -31,14 +49,9 @@ def tasks(
 
     Change the weights of reward terms in a job's YAML: train: {config: {rewards: {forward: 2.0}}}
     """
-    if sys.stderr.isatty():
-        echo("importing the simulation, which takes some seconds …", err=True)
     found = ask_worker("worker.tasks", [name] if name else [], "tasks can't be listed")
-    if as_json:
-        echo_json(found, indent=1)
-        return
-    print_wrapped(_table(found))
-    if not name:
+    TASKS.show(found, as_json)
+    if not name or as_json:
         return
     console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
     for kind in ("observations", "actions"):
@@ -46,11 +59,20 @@ def tasks(
     if robots := found[0]["robots"]:
         console.print("\nROBOTS\n" + "\n".join(robots), markup=False)
     for section, rows in found[0].get("tables", {}).items():
-        echo("")
-        print_wrapped(_terms(section, rows))
-    if numbers := found[0].get("numbers"):
-        console.print("\nNUMBERS of train.config.numbers and train.config.curriculum", markup=False)
-        print_wrapped(_numbers(numbers))
+        terms(section, rows).show(rows)
+    NUMBERS.show([*(found[0].get("numbers") or {}).items()])
+
+
+def terms(section: str, rows: Sequence[dict[str, str]]) -> Resource:
+    """A section of a declaration, without empty columns."""
+    columns = list(rows[0])
+    return Resource(
+        {column: column for column in columns},
+        optional=columns,
+        folded=[column for column in columns if column != "name"],
+        title=section.upper(),
+        blank="",
+    )
 
 
 def ask_worker(module: str, arguments: Sequence[str], failure: str) -> Any:
@@ -67,53 +89,13 @@ def ask_worker(module: str, arguments: Sequence[str], failure: str) -> Any:
     """
     if find_spec("newton") is None:
         raise ServerError(f"{failure} where no simulation is installed: pip install 'muster[worker]'")
-    asked = subprocess.run(
-        [sys.executable, "-P", "-m", module, *arguments], capture_output=True, text=True, check=False
-    )
-    lines = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
-    if asked.returncode == 2:
+    if sys.stderr.isatty():
+        echo("importing the simulation, which takes some seconds …", err=True)
+    done = subprocess.run([sys.executable, "-P", "-m", module, *arguments], capture_output=True, text=True, check=False)
+    lines = done.stderr.strip().splitlines() or [f"it ended with exit code {done.returncode}"]
+    if done.returncode == 2:
         raise SpecError(lines[-1])
-    if asked.returncode:
+    if done.returncode:
         raise ServerError(f"{failure}: {lines[-1]}")
     # a user's module may print before it while it is imported
-    return json.loads(asked.stdout.splitlines()[-1])
-
-
-def _terms(section: str, rows: list[dict[str, str]]) -> Table:
-    """A section of a declaration, without empty columns."""
-    table = Table(box=None, pad_edge=False, title=section.upper(), title_justify="left", title_style="")
-    columns = [column for column in rows[0] if any(row[column] for row in rows)]
-    for column in columns:
-        table.add_column(column, overflow="fold", no_wrap=column == "name")
-    for row in rows:
-        table.add_row(*(row[column] for column in columns))
-    return table
-
-
-def _numbers(numbers: dict[str, list[float]]) -> Table:
-    table = Table(box=None, pad_edge=False, show_header=False)
-    table.add_column("place", no_wrap=True)
-    table.add_column("value", overflow="fold")
-    for place, values in numbers.items():
-        table.add_row(place, ", ".join(f"{value:g}" for value in values))
-    return table
-
-
-def _table(found: list[dict[str, Any]]) -> Table:
-    table = Table(box=None, pad_edge=False)
-    for column in ("TASK", "OBSERVATIONS", "ACTIONS", "CONTROL", "EPISODE"):
-        table.add_column(column, no_wrap=True)
-    table.add_column("REWARDS", overflow="fold")
-    for task in found:
-        if "error" in task:
-            table.add_row(task["name"], "-", "-", "-", "-", f"can't be imported: {task['error']}")
-            continue
-        table.add_row(
-            task["name"],
-            str(len(task["observations"])),
-            str(len(task["actions"])),
-            f"{task['control_hz']:g} Hz",
-            f"{task['episode_seconds']:g} s",
-            "  ".join(f"{term} {weight:g}" for term, weight in task["rewards"].items()),
-        )
-    return table
+    return json.loads(done.stdout.splitlines()[-1])

@@ -8,12 +8,12 @@ from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.jobs import SetOption, SpecArgument, store_here, submit_spec
-from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
+from orchestrator.cli.command_options import CpusOption, SetOption, SpecArgument, StoreOption
+from orchestrator.cli.controllers import controller, see_through
+from orchestrator.cli.submitting import load_spec, store_here, submit_spec
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.domain.errors import SpecError
-from orchestrator.spec import file as specfile
 from orchestrator.spec.model import Spec
 from orchestrator.spec.sections import Resources, Retry
 from shared_store.contract.error_text import counted
@@ -38,7 +38,7 @@ def verify_resume(
     store: StoreOption = None,
     cpus: CpusOption = None,
 ) -> None:
-    """Prove that a training survives a crash: train twice, kill one, compare the results bit by bit.
+    """Prove bit by bit that a training survives a crash.
 
     The spec's training runs for AT + ITERATIONS iterations twice: once uninterrupted, and once with SIGKILL of the main rank right after
     iteration AT, before anything of that iteration is written (MUSTER_KILL_AT in the job's environment, which affects only the first
@@ -46,10 +46,10 @@ def verify_resume(
     index, and every metric except times is compared bit by bit: exit 0 if all are equal, 1 at the first difference. On CPUs they must be
     equal; GPUs add in no fixed order. Both runs stay in the store.
     """
-    loaded = specfile.load(spec, set_, lambda: store_here(store))
+    loaded = load_spec(spec, set_, store=lambda: store_here(store))
     straight, killed = _pair(loaded, spec, at, iterations)
-    for note in _notes(loaded, at):
-        echo(note)
+    for line in _notes(loaded, at):
+        echo(line)
     with controller(store, cpus) as connect:
         first = _train(connect, straight, spec)
         second = _train(connect, killed, spec, MUSTER_KILL_AT=str(at))

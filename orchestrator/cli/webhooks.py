@@ -2,21 +2,40 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from functools import partial
+from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from shared_store.contract.error_text import counted
 
 
+def _limits(key: str, webhook: dict[str, Any]) -> str:
+    return " ".join(webhook[key] or ["all"])
+
+
+WEBHOOKS = Resource(
+    {
+        "NAME": "name",
+        "RECEIVER": "receiver",
+        **{key.upper(): partial(_limits, key) for key in ("statuses", "queues", "kinds")},
+        "WAITING": "waiting",
+        "GIVEN UP": lambda hook: len(hook["failed"]),
+        "PROBLEM": "problem",
+    },
+    "no webhooks; name them in a file and start the controller with: muster serve --webhooks FILE",
+    "/api/webhooks",
+)
+
+
 def register(app: typer.Typer) -> None:
     group = make_group(
-        "List and test the controller's webhooks, which report the end of jobs.\n\nConfigure them with `muster serve --webhooks FILE`, a JSON "
+        "List and test the webhooks that report the end of jobs.\n\nConfigure them with `muster serve --webhooks FILE`, a JSON "
         'object by name: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}. The database keeps them, '
         "sealed, for later starts; another file replaces them.",
         "Examples:  muster webhooks test chat   then   muster webhooks list",
@@ -30,29 +49,15 @@ def list_webhooks(as_json: JsonOption = False) -> None:
     """List the webhooks, with their waiting messages and those given up."""
     with Client.connect() as client:
         found = client.get("/api/webhooks")
-    if as_json:
-        echo_json(found, indent=1)
-        return
-    if not found:
-        echo("no webhooks; name them in a file and start the controller with: muster serve --webhooks FILE")
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("NAME", "RECEIVER", "STATUSES", "QUEUES", "KINDS", "WAITING", "GIVEN UP", "PROBLEM"):
-        table.add_column(column, no_wrap=True)
-    for each in found:
-        limits = [" ".join(each[key] or ["all"]) for key in ("statuses", "queues", "kinds")]
-        counts = str(each["waiting"]), str(len(each["failed"]))
-        table.add_row(each["name"], each["receiver"], *limits, *counts, each["problem"] or "")
-    print_cut(table)
-    for each in found:
+    WEBHOOKS.show(found, as_json)
+    for each in [] if as_json else found:
         for message in each["failed"]:
-            echo(
-                f"given up: {each['name']}, job {message['job']}, {counted(message['tries'], 'try', 'tries')}: {message['problem']}"
-            )
+            tries = counted(message["tries"], "try", "tries")
+            echo(f"given up: {each['name']}, job {message['job']}, {tries}: {message['problem']}")
 
 
 def test(
-    name: Annotated[str, typer.Argument(help="Of the webhook.")],
+    name: Annotated[str, typer.Argument(help="Name of the webhook.")],
     as_json: JsonOption = False,
 ) -> None:
     """Send a sample once; exit 1 if the receiver does not accept it.

@@ -21,7 +21,7 @@ from orchestrator.services.context import Context, Known, archived, using
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import newest_job, spec_of
 from orchestrator.services.sources import with_teacher
-from orchestrator.services.spec_submission import Changes, commit_submission, inherited, submit
+from orchestrator.services.spec_submission import Changes, check, commit_submission, inherited, submit
 from orchestrator.services.submission import record_of
 from orchestrator.services.texts import keep_again
 from orchestrator.spec.changes import override
@@ -39,7 +39,13 @@ _RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": (
 
 
 def resume(
-    controller: Controller, actor: Actor, run: Run, changes: Changes, idempotency_key: str | None = None
+    controller: Controller,
+    actor: Actor,
+    run: Run,
+    changes: Changes,
+    idempotency_key: str | None = None,
+    *,
+    dry_run: bool = False,
 ) -> dict[str, Any]:
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
@@ -48,13 +54,14 @@ def resume(
         run: The run.
         changes: The changes. The run keeps its worlds; another number of nodes shares them anew.
         idempotency_key: A second call with it answers what the first one did.
+        dry_run: Submit nothing, and answer the definition that would be registered, and its queue.
 
     Raises:
         ClientError: The run is complete or being written, the checkpoint is missing or damaged, a change is impossible.
     """
     with using(controller, run.name, cites=False):
         return with_teacher(
-            controller, lambda teacher: _resume(controller, actor, run, changes, idempotency_key, teacher)
+            controller, lambda teacher: _resume(controller, actor, run, changes, idempotency_key, teacher, dry_run)
         )
 
 
@@ -65,6 +72,7 @@ def _resume(
     changes: Changes,
     idempotency_key: str | None,
     teacher: TeacherCopy | None,
+    dry_run: bool,
 ) -> dict[str, Any]:
     found, checkpoints = facts_of(run), list_checkpoints(run)
     if found.is_missing():
@@ -116,6 +124,9 @@ def _resume(
                 environment["MUSTER_WORLDS"] = str(_worlds(session, actor, found, before, spec, chosen))
             if chosen and changes.checkpoint is not None:
                 environment["MUSTER_CHECKPOINT"] = chosen.name
+            if dry_run:
+                definition = check(context, spec, changes.directory, f"run {run.name}")
+                return {"definition": definition, "queue": spec.queue}
             job = submit(context, spec, changes.directory, f"run {run.name}", environment, record=record)
             return {
                 **submission.answer(job),

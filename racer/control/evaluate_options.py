@@ -80,7 +80,10 @@ def race_or_evaluate(
         "crash_penalty": penalty,
         "accept_changed_robot": given["accept_changed_robot"] or None,
     }
-    place = {key: given[key] for key in ("source", "name", "engine", "store", "cpus", "as_json")}
+    place = {
+        key: given[key]
+        for key in ("source", "name", "engine", "store", "cpus", "as_json", "queue", "follow", "dry_run")
+    }
     request = EvaluationRequest(section=section, changes=given["set_"] or (), kind="race", **place)
 
     def copy(run: Path, evaluation: str) -> None:

@@ -11,12 +11,18 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.command_options import (
+    CpusOption,
+    JsonOption,
+    ModelArgument,
+    OverwriteOption,
+    StoreOption,
+    split_model,
+)
+from orchestrator.cli.controllers import controller, see_through
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.models import ModelArgument, split_model
+from orchestrator.cli.outputs import check_output
 from orchestrator.cli.progress import summary
-from orchestrator.cli.recordings import OverwriteOption, check_output
-from orchestrator.cli.serving import CpusOption, StoreOption, controller, see_through
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, NotServing, UsageError

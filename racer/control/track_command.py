@@ -10,10 +10,10 @@ from typing import Annotated, Any
 import typer
 from rich.table import Table
 
-from orchestrator.cli.jobs import JsonOption
+from orchestrator.cli.command_options import JsonOption, OverwriteOption, StoreOption
+from orchestrator.cli.controllers import controller
 from orchestrator.cli.misuse import make_group
-from orchestrator.cli.recordings import OverwriteOption, check_output
-from orchestrator.cli.serving import StoreOption, controller
+from orchestrator.cli.outputs import check_output
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.domain.errors import ServerError, UsageError
 from racer.control.track_orders import ask

@@ -28,7 +28,7 @@ _EXPECTED = {
     "dataclass_exact_type": "expected a mapping",
 }
 
-OF_PLUGIN = "a plug-in's: install its package"
+OF_PLUGIN = "if a plug-in provides it, install the plug-in's package"
 """What to do where a name is unknown that a plug-in may bring: a task, a command, a section of a job."""
 
 Path = tuple[str | int, ...]

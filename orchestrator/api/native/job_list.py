@@ -129,7 +129,7 @@ def page_of_jobs(
     progress = _progress(controller, actor, trainings)
     states = wanted.statuses or tuple(Status)
     return {
-        "jobs": [{**row, "progress": progress.get(row["id"])} for row, _ in rows],
+        "jobs": [{**row, "progress": progress.get(row["id"]), "isOwn": row["owner"] == actor.name} for row, _ in rows],
         "total": sum(counts.get(each, 0) for each in states),
         "counts": counts,
         "areMore": bool(conditions) and sum(counts.values()) == MOST_COUNTED,

@@ -42,6 +42,7 @@ class ResumeRequest(_ChangesRequest):
     """Changes of a resumed run."""
 
     checkpoint: int | None = Field(default=None, description="iteration; the newest where absent")
+    dry_run: bool = Field(default=False, description="check it, and answer the definition that would be registered")
 
 
 class CloneRequest(_ChangesRequest):
@@ -140,7 +141,7 @@ def resume_run(
     """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
     controller, actor = controller_of(request), actor_of(request)
     run = permitted_run(controller, actor, name, Operation.RESUME_RUN)
-    return resume(controller, actor, run, body.changes(), idempotency_key)
+    return resume(controller, actor, run, body.changes(), idempotency_key, dry_run=body.dry_run)
 
 
 @router.post("/runs/{name}/clone")

@@ -347,7 +347,7 @@ def refused(home: Path, engine: str, code: int = 1, **env: str) -> str:
 
 
 def test_an_engine_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Path) -> None:
-    assert refused(tmp_path, "dokcer", 2) == "muster: --engine dokcer: there is no such engine; did you mean docker?\n"
+    assert refused(tmp_path, "dokcer", 2) == "muster: --engine dokcer: unknown engine; did you mean docker?\n"
     assert not (tmp_path / "muster.db").exists()
     said = "muster: no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST\n"
     assert refused(tmp_path, "docker", DOCKER_HOST="unix:///nowhere.sock") == said

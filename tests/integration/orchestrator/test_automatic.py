@@ -122,7 +122,7 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
     assert "run taught: the evaluation of checkpoint 00000020-e1 failed: the test says so" in caplog.text
     assert controller.newest()["passed"] == 1, "40, or 60"
     shown = " ".join(controller.muster("show", training).stdout.split())
-    assert "evaluating: taught@70 by job " in shown and "1 checkpoint passed over" in shown
+    assert "evaluating: taught@70 by job " in shown and "1 checkpoint skipped" in shown
     controller.save(80)
     assert [each.iteration for each in list_checkpoints(run)] == [70, 80]
     assert controller.client.get(f"/api/jobs/{training}")["status"] == "RUNNING", "which no evaluation concerns"

@@ -76,7 +76,7 @@ def test_a_run_whose_task_is_not_installed_is_refused_with_the_same_line(full: S
     more = {"render": ("-o", "film.gif"), "clone": ("--name", "again")}.get(kind, ())
     said = refusal(full, kind, "gone", *more)
     assert "run gone: train.task: no task is called 'Vanished'; " in said
-    assert said.rstrip().endswith("(your own: module:Class; a plug-in's: install its package)")
+    assert said.rstrip().endswith("(your own: module:Class; if a plug-in provides it, install the plug-in's package)")
 
 
 def test_a_plan_of_a_run_whose_task_is_not_installed_is_refused(full: Serving, tmp_path: Path) -> None:
@@ -141,8 +141,8 @@ def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) 
         (["taught"], "that is one run, taught; name two or more to compare"),
         (["taught", "slwo"], "did you mean slow"),
         (["robot-*", "slow"], "no run matches robot-*"),
-        (["taught", "slow", "-o", str(tmp_path / "no" / "x.png")], "is not a directory"),
-        (["taught", "slow", "-o", str(tmp_path / "x.xyz")], "unknown ending; use .png, .svg, .pdf"),
+        (["taught", "slow", "-o", str(tmp_path / "no" / "x.png")], "is not a directory; create it"),
+        (["taught", "slow", "-o", str(tmp_path / "x.xyz")], "unknown ending; use one of .png, .svg, .pdf"),
         (["empty", "empty*", "of-*", "-o", str(tmp_path / "x.png")], "no run matches of-*"),
     ):
         assert said in refusal(full, "compare", *options)
@@ -169,5 +169,5 @@ def test_a_job_is_submitted_under_another_name(full: Serving) -> None:
     assert submitted["jobName"] == "second" and full.detail(submitted["jobId"])["spec"]["name"] == "second"
     full.client.batch("TerminateJob", jobId=submitted["jobId"], reason="seen")
     twice = refusal(full, *submit, "second", "--set", "name=third")
-    assert twice == "muster: --set name=third: --name second names the job; give one of them\n"
+    assert twice == "muster: --set name=third: --name sets name; use one of them\n"
     assert "--set: name: " in refusal(full, *submit, "a b")

@@ -53,6 +53,6 @@ def test_a_name_means_ones_own_job_and_that_of_another_is_named_with_its_owner(l
     assert header.split()[:4] == ["JOB", "NAME", "OWNER", "STATUS"]
     assert [row.split()[:3] for row in rows] == [[alices, "samejob", "alice"], [bobs, "samejob", "bob"]]
     stopped = lab.muster("bob", "stop", "samejob", "--no-wait")
-    assert stopped.stdout == f"samejob ({bobs}) is asked to stop\n", stopped.stderr
+    assert stopped.stdout == f"samejob ({bobs}): stop requested\n", stopped.stderr
     other = lab.muster("eve", "stop", "samejob", "--no-wait")
-    assert other.stdout == f"samejob ({alices}) of alice is asked to stop\n", "the newest, with its owner"
+    assert other.stdout == f"samejob ({alices}) of alice: stop requested\n", "the newest, with its owner"

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.cli.jobs import submit_spec
+from orchestrator.cli.submitting import submit_spec
 from orchestrator.client import Client
 from orchestrator.domain.errors import ApiError, SpecError
 from orchestrator.engines.api import Gang, Plan

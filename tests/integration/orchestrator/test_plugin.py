@@ -54,7 +54,7 @@ def run_of(server: Serving) -> str:
 def test_its_command_route_and_page_are_there(server: Serving) -> None:
     run = run_of(server)
     told = run_muster("notes", run, "walks sideways", home=server.home)
-    assert (told.returncode, told.stdout) == (0, f"{run}: walks sideways\n"), told.stderr
+    assert (told.returncode, told.stdout.split()) == (0, ["RUN", "NOTES", run, "walks", "sideways"]), told.stderr
     assert "Print the notes on all runs or on one, or add one." in run_muster("--help", home=server.home).stdout
     assert server.client.get("/api/notes") == [{"run": run, "notes": ["walks sideways"]}]
     page = httpx.get(f"{server.url}/notes", headers={"accept": "text/html"})
@@ -161,8 +161,8 @@ def test_a_controller_that_started_before_the_plug_in_was_installed_is_to_be_sta
         done = run_muster("notes", home=tmp_path, PYTHONPATH=str(installed))
     assert (done.returncode, done.stderr) == (
         2,
-        "muster: GET /api/notes: Not Found; the controller has no such plug-in: install its package where the controller runs, and "
-        "start the controller again\n",
+        "muster: GET /api/notes: Not Found; the controller lacks this plug-in: install its package where the controller runs, and "
+        "restart the controller\n",
     )
 
 
@@ -181,7 +181,7 @@ BROKEN = {
     "options=(('evalute', 'tally_parts:MORE'),)": (
         "--help",
         "",
-        "options: there is no command evalute; did you mean e",
+        "options: unknown command evalute; did you mean e",
     ),
     "options=(('evaluate', 'tally_parts:MORE'),)": (
         "evaluate --help",

@@ -89,7 +89,7 @@ def test_an_archived_run_is_kept_out_of_lists_and_nothing_is_added_to_it(server:
     assert f"kept: run {run}: it is archived" in plan
     refused(["runs", "delete", run, "--yes"], server.home, 1, f"run {run} is kept: it is archived")
     said(server, "runs", "archive", run, "--undo")
-    refused(["runs", "delete", run], server.home, 2, "give --yes")
+    refused(["runs", "delete", run], server.home, 2, "add --yes")
     assert f"deleted run {run}: " in said(server, "runs", "delete", run, "--yes")
     assert run not in runs_of(server) and server.detail(job)["status"] == "SUCCEEDED"
     shown = said(server, "show", job)

@@ -108,7 +108,7 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         ("record", "nothing", "-o", "x.mcap"): "run nothing does not exist",
         ("record", f"{run.name}@7", "-o", "x.mcap"): f"no checkpoint of iteration 7; the nearest is {iterations[0]}",
         ("record", run.name, "-o", str(tmp_path)): "it is a directory; name a file in it",
-        ("record", run.name, "-o", str(tmp_path / "no" / "x.mcap")): f"there is no directory {tmp_path / 'no'}",
+        ("record", run.name, "-o", str(tmp_path / "no" / "x.mcap")): f"{tmp_path / 'no'} is not a directory",
         ("record", run.name, "-o", "x.bag"): "unknown ending; use one of .mcap",
         ("record", run.name): "-o is missing: muster record",
         ("record", "--recover", str(tmp_path / "x.mcap.partial")): "there is no such file",

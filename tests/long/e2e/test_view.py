@@ -222,7 +222,7 @@ def test_what_can_t_be_viewed_is_refused_in_one_line(server: Serving, job: str, 
     (tmp_path / "text.rrd").write_text("no recording")
     refused = {
         ("view", "nothing"): "run nothing does not exist",
-        ("view", "nothing.mcap"): "nothing.mcap: there is no such file",
+        ("view", "nothing.mcap"): "nothing.mcap: no such file",
         ("view", f"{run.name}@7"): "no checkpoint of iteration 7; the nearest is",
         ("view", run.name, "--memory", "much"): "expected a number with MB or GB",
         ("view", str(tmp_path / "text.mcap")): "it does not begin as an MCAP file does",

@@ -13,7 +13,7 @@ import pytest
 import torch
 import yaml
 
-from orchestrator.cli.tasks import _table
+from orchestrator.cli.tasks import TASKS
 from orchestrator.cli.terminal import Console
 from shared_store.volume.layout import Store
 from shared_store.volume.metrics import read_metrics
@@ -44,7 +44,7 @@ def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_pat
     assert not (tmp_path / "home").exists(), "a listing needs no controller"
     console = Console(width=200)
     with console.capture() as captured:  # another process would import the simulation again
-        console.print(_table(found))
+        console.print(TASKS.table(found))
     table = captured.get()
     assert re.search(r"^Ant +35 +8 +60 Hz +16 s +forward 1 +heading 0.5 +up 0.1 +alive 0.5 +action -0.005", table, re.M)
     assert re.search(r"^Quadruped +48 +12 +50 Hz +20 s +track_linear 2", table, re.M)

@@ -9,7 +9,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.cli.tasks import _numbers, _terms
+from orchestrator.cli.tasks import NUMBERS
+from orchestrator.cli.tasks import terms as section_of
 from orchestrator.cli.terminal import Console
 from tests.support.worker.robots import needs_mjlab
 from worker.tasks import find_task
@@ -68,8 +69,8 @@ def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> Non
     console = Console(width=400)
     with console.capture() as captured:
         for section, rows in found["tables"].items():
-            console.print(_terms(section, rows))
-        console.print(_numbers(found["numbers"]))
+            console.print(section_of(section, rows).table(rows))
+        console.print(NUMBERS.table([*found["numbers"].items()]))
     text = captured.get()
     for rows in found["tables"].values():
         assert all(row["name"] in text for row in rows if "name" in row)

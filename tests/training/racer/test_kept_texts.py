@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from orchestrator.cli.jobs import submit_spec
+from orchestrator.cli.submitting import submit_spec
 from orchestrator.spec import file as specfile
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.evaluations import list_evaluations

@@ -4,9 +4,12 @@ from typing import Annotated
 
 import typer
 
-from orchestrator.cli.terminal import echo
+from orchestrator.cli.command_options import JsonOption
+from orchestrator.cli.listings import Resource
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError
+
+NOTES = Resource({"RUN": "run", "NOTES": lambda each: "; ".join(each["notes"])}, "no run has a note", "/api/notes")
 
 
 def register(app: typer.Typer) -> None:
@@ -16,6 +19,7 @@ def register(app: typer.Typer) -> None:
 def notes(
     run: Annotated[str | None, typer.Argument(help="The run of a new note.")] = None,
     text: Annotated[str | None, typer.Argument(help="The note.")] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Print the notes on all runs or on one, or add one."""
     if text is not None and not text.strip():
@@ -23,6 +27,5 @@ def notes(
     with Client.connect() as client:
         if run and text:
             client.post(f"/api/notes/{named(run)}", {"text": text})
-        for each in client.get("/api/notes"):
-            if run in (None, each["run"]):
-                echo(f"{each['run']}: {'; '.join(each['notes'])}")
+        found = client.get(NOTES.route)
+    NOTES.show([each for each in found if run in (None, each["run"])], as_json)

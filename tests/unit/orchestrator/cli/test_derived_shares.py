@@ -16,7 +16,8 @@ def test_a_job_beside_a_run_does_not_name_the_runs_share(monkeypatch: pytest.Mon
     answer: dict[str, Any] = {"run": "taught", "spec": TRAINED}
     monkeypatch.setattr(Client, "get", lambda self, path, **query: answer)
     with Client("http://127.0.0.1:1") as client:
-        spec = evaluations._spec(client, "taught", None, {"episodes": 1}, [], [], "evaluate")
+        request = evaluations.EvaluationRequest("taught", {})
+        spec = evaluations._spec(client, "taught", request, {"episodes": 1}, [])
         assert (spec.queue, spec.share) == ("fair", None)
         recorded = recordings._common(answer, "record")
         assert recorded["queue"] == "fair" and "share" not in recorded
