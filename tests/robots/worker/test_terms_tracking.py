@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from worker.tasks.terms.frame_sampling import AdaptiveSampling, FrameSampling
+from worker.tasks.terms.motion import Motion, MotionArrays
 
 from tests.support.refusals import refusal
 from tests.support.worker.terms_rig import (
@@ -32,8 +34,6 @@ from tests.support.worker.terms_rig import (
 )
 from worker.simulation.sensors.frames import FrameArrays
 from worker.tasks.terms import following, manipulation, tracking
-from worker.tasks.terms.frame_sampling import AdaptiveSampling, FrameSampling
-from worker.tasks.terms.motion import Motion, MotionArrays
 
 SHARED = ["near", "commanded_point", "frame_of", "anchor_pose", "wanted_anchor", "relative_reference", "sampled"]
 SHARED += ["anchor_way", "body_way", "body_turn_error"]

@@ -22,11 +22,12 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.declare.term_needs import needs
-from worker.tasks.terms.frame_sampling import drawn_frame
-from worker.tasks.terms.motion import MotionArrays
+from worker.tasks.terms.more.frame_sampling import drawn_frame
+from worker.tasks.terms.more.motion import MotionArrays
 from worker.tasks.terms.placing import between, set_joint, within_limits
 
 wp.set_module_options({"enable_backward": False})
+
 
 _NONE = wp.constant(wp.vec3(0.0, 0.0, 0.0))
 """Half widths of numbers that are not drawn."""
@@ -124,7 +125,8 @@ def motion_command(
 def advance_motion(world: int, episodes: EpisodeArrays, motion: MotionArrays, command: int):
     """Advance by the frames of one control step; after the last frame :func:`motion_over` is true.
 
-    mjlab: MotionCommand (which starts again elsewhere after the last frame). Isaac Lab: MotionCommand (of BeyondMimic, as mjlab's).
+    mjlab: MotionCommand (which starts again elsewhere after the last frame). Isaac Lab: MotionCommand (of BeyondMimic, as
+    mjlab's).
     """
     episodes.memory[world, command] = episodes.memory[world, command] + motion.rate
     motion.sampling.frames[world] = episodes.memory[world, command]
@@ -141,10 +143,7 @@ def evenness_of_frames(world: int, motion: MotionArrays) -> float:
 
 @wp.func
 def motion_over(world: int, episodes: EpisodeArrays, motion: MotionArrays, command: int) -> bool:
-    """Whether the motion is over; use it as a time-out.
-
-    mjlab: -. Isaac Lab: -.
-    """
+    """Whether the motion is over; use it as a time-out."""
     return episodes.memory[world, command] >= float(motion.roots.shape[0])
 
 
@@ -152,7 +151,7 @@ def motion_over(world: int, episodes: EpisodeArrays, motion: MotionArrays, comma
 def wanted_joint_position(world: int, episodes: EpisodeArrays, motion: MotionArrays, joint: int, command: int) -> float:
     """Position of a joint in the motion [m, rad].
 
-    mjlab: generated_commands (of MotionCommand, its first half). Isaac Lab: generated_commands (of MotionCommand, its first half).
+    mjlab, Isaac Lab: generated_commands (of MotionCommand, its first half).
     """
     return motion.joint_positions[frame_of(episodes, motion, world, command), joint]
 
@@ -161,7 +160,7 @@ def wanted_joint_position(world: int, episodes: EpisodeArrays, motion: MotionArr
 def wanted_joint_velocity(world: int, episodes: EpisodeArrays, motion: MotionArrays, joint: int, command: int) -> float:
     """Velocity of a joint in the motion [m/s, rad/s].
 
-    mjlab: generated_commands (of MotionCommand, its second half). Isaac Lab: generated_commands (of MotionCommand, its second half).
+    mjlab, Isaac Lab: generated_commands (of MotionCommand, its second half).
     """
     return motion.joint_velocities[frame_of(episodes, motion, world, command), joint]
 

@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from worker.simulation.sensors.places import place_names
-from worker.tasks.terms.frame_sampling import AdaptiveSampling, FrameSampling, SamplingArrays
+from worker.tasks.terms.more.frame_sampling import AdaptiveSampling, FrameSampling, SamplingArrays
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView
