@@ -11,8 +11,8 @@ import pytest
 import torch
 import warp as wp
 import yaml
-from worker.tasks.settings_page import sketch
 
+from docs.tools.settings_page import sketch
 from tests.conftest import REPOSITORY
 from tests.support.worker.page_tasks import blocks, module
 from tests.support.worker.robots import need_mjlab

@@ -47,10 +47,7 @@ def position_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: 
 @needs(kind="velocity")
 @wp.func
 def velocity_target(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, value: float):
-    """A velocity: the target of a <velocity> actuator is ``value`` [m/s, rad/s].
-
-    mjlab, Isaac Lab: JointVelocityAction.
-    """
+    """The target of a <velocity> actuator is ``value`` [m/s, rad/s]. mjlab, Isaac Lab: JointVelocityAction."""
     worlds.controls[world, robot.actuators[joint]] = value
 
 

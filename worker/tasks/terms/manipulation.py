@@ -49,10 +49,7 @@ def hand_object_distance(world: int, worlds: WorldArrays, robot: RobotArrays, ha
 def object_target_distance(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, command: int
 ) -> float:
-    """Distance between an object, which ``robot=`` names, and its target [m].
-
-    mjlab: position_error (of LiftingCommand).
-    """
+    """Distance of an object, which ``robot=`` names, to its target [m]. mjlab: position_error (of LiftingCommand)."""
     return wp.length(command_vector(world, episodes, command) - root_position_of(worlds, robot, world))
 
 

@@ -29,10 +29,7 @@ def imu_linear_velocity(world: int, imu: ImuArrays) -> wp.vec3:
 
 @wp.func
 def frame_height(world: int, frames: FrameArrays, index: int) -> float:
-    """Height of a frame's origin, along z of the frame that the sensor refers to [m].
-
-    mjlab: foot_height (on flat ground).
-    """
+    """Height of a frame's origin along z of the sensor's reference [m]. mjlab: foot_height (on flat ground)."""
     return frames.positions[world, index][2]
 
 
@@ -47,7 +44,4 @@ def angular_momentum(world: int, momentum: MomentumArrays) -> wp.vec3:
 
 @composed(length_squared, angular_momentum)
 def angular_momentum_squared():
-    """Square of the angular momentum about the common centre of mass [kg^2 m^4/s^2].
-
-    mjlab: angular_momentum_penalty.
-    """
+    """Square of the angular momentum about the centre of mass [kg^2 m^4/s^2]. mjlab: angular_momentum_penalty."""

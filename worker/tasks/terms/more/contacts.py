@@ -30,28 +30,19 @@ def contact_strength():
 
 @wp.func
 def contact_time(world: int, contacts: ContactArrays, index: int) -> float:
-    """Time since contact began, 0 without contact [s].
-
-    mjlab, Isaac Lab: current_contact_time (of a contact sensor's data).
-    """
+    """Time since contact began, 0 without [s]. mjlab, Isaac Lab: current_contact_time (of a contact sensor's data)."""
     return contacts.contact_time[world, index]
 
 
 @wp.func
 def touchdown(world: int, contacts: ContactArrays, index: int) -> float:
-    """1 in the control step in which contact began, else 0.
-
-    mjlab, Isaac Lab: compute_first_contact (of a contact sensor).
-    """
+    """1 in the step in which contact began, else 0. mjlab, Isaac Lab: compute_first_contact (of a contact sensor)."""
     return wp.where(first_contact(contacts, world, index), 1.0, 0.0)
 
 
 @wp.func
 def liftoff(world: int, contacts: ContactArrays, index: int) -> float:
-    """1 in the control step in which contact was lost, else 0.
-
-    mjlab, Isaac Lab: compute_first_air (of a contact sensor).
-    """
+    """1 in the step in which contact was lost, else 0. mjlab, Isaac Lab: compute_first_air (of a contact sensor)."""
     return wp.where(first_air(contacts, world, index), 1.0, 0.0)
 
 
@@ -180,8 +171,5 @@ def no_contact(world: int, contacts: ContactArrays, force: float = 1.0) -> float
 
 @wp.func
 def contact_force_excess(world: int, contacts: ContactArrays, index: int, force: float) -> float:
-    """Excess of the greatest net contact force within the last control step over ``force`` [N].
-
-    Isaac Lab: contact_forces.
-    """
+    """Excess of the greatest net force within the last control step over ``force`` [N]. Isaac Lab: contact_forces."""
     return wp.max(contacts.peaks[world, index] - force, 0.0)

@@ -100,10 +100,7 @@ def joint_effort_excess(
 
 @wp.func
 def joint_work(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int) -> float:
-    """Mechanical power that an actuator spends on a joint [W]; braking recovers nothing.
-
-    mjlab: electrical_power_cost.
-    """
+    """Mechanical power that an actuator spends on a joint [W]; braking recovers none. mjlab: electrical_power_cost."""
     return wp.max(joint_power(world, worlds, robot, joint), 0.0)
 
 

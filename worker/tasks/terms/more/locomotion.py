@@ -124,10 +124,7 @@ def motion_when_standing(
 
 @wp.func
 def heading_error(world: int, episodes: EpisodeArrays, command: int) -> float:
-    """Remaining angle to the heading of a planar pose command [rad].
-
-    Isaac Lab: heading_command_error_abs (of navigation).
-    """
+    """Angle to the heading of a planar pose command [rad]. Isaac Lab: heading_command_error_abs (of navigation)."""
     return wp.abs(episodes.memory[world, command + 2])
 
 

@@ -40,10 +40,7 @@ def root_displacement(world: int, worlds: WorldArrays, robot: RobotArrays) -> wp
 
 @wp.func
 def root_orientation(world: int, worlds: WorldArrays, robot: RobotArrays) -> wp.quat:
-    """Rotation from the root to the world frame, a quaternion xyzw whose w is not negative.
-
-    Isaac Lab: root_quat_w (wxyz).
-    """
+    """Rotation from the root to the world, a quaternion xyzw whose w is not negative. Isaac Lab: root_quat_w (wxyz)."""
     return unique_quaternion(root_rotation_of(worlds, robot, world))
 
 
@@ -126,10 +123,7 @@ def vertical_velocity_squared():
 
 @composed(squared, vertical, root_com_linear_velocity)
 def vertical_com_velocity_squared():
-    """Square of the velocity of the root's centre of mass along the root's z axis [m^2/s^2].
-
-    Isaac Lab: lin_vel_z_l2.
-    """
+    """Square of the velocity of the root's centre of mass along its z axis [m^2/s^2]. Isaac Lab: lin_vel_z_l2."""
 
 
 @composed(likeness, tilt_squared)

@@ -149,7 +149,7 @@ def motion_over(world: int, episodes: EpisodeArrays, motion: MotionArrays, comma
 
 @wp.func
 def wanted_joint_position(world: int, episodes: EpisodeArrays, motion: MotionArrays, joint: int, command: int) -> float:
-    """Position of a joint in the motion [m, rad].
+    """Joint position in the motion [m, rad].
 
     mjlab, Isaac Lab: generated_commands (of MotionCommand, its first half).
     """
@@ -158,7 +158,7 @@ def wanted_joint_position(world: int, episodes: EpisodeArrays, motion: MotionArr
 
 @wp.func
 def wanted_joint_velocity(world: int, episodes: EpisodeArrays, motion: MotionArrays, joint: int, command: int) -> float:
-    """Velocity of a joint in the motion [m/s, rad/s].
+    """Joint velocity in the motion [m/s, rad/s].
 
     mjlab, Isaac Lab: generated_commands (of MotionCommand, its second half).
     """
