@@ -25,7 +25,7 @@ The functions of `worker.tasks.terms`. A declared task names them, such as
 `Reward(terms.joint_velocity_squared, joints="*_knee")`; [porting.md](porting.md) maps mjlab's and Isaac Lab's terms to
 them. `python -m docs.tools` writes this page from the functions' docstrings.
 
-- **Given** lists the parameters from the declaration: `joints`, `bodies`, `sites` are patterns, and the function is
+- **Parameters** are those that a declaration sets: `joints`, `bodies`, `sites` are patterns, and the function is
   called for each match; `size` is the number of calls, with `index` from 0, by default one for each column of its
   sensor; `command` names a command. A parameter of a type `...Arrays` takes the name of a sensor or, for `RobotArrays`,
   of a robot or object; it may be omitted if only one fits. All others are numbers in the unit that the meaning gives;
@@ -56,7 +56,7 @@ term here but a `Randomize`: [their names](randomization.md#names-of-mjlab-and-i
 ELSEWHERE_HEAD = """\
 ## Names that are no terms here
 
-| theirs | whose | here |
+| their name | library | here |
 |---|---|---|
 """
 
@@ -72,7 +72,7 @@ def reference() -> str:
             if found == group
         ]
         paragraph = f"\n\n{_plain(rest)}" if rest else ""
-        table = "\n".join(["| term | given | returns | meaning |", "|---|---|---|---|", *rows])
+        table = "\n".join(["| term | parameters | returns | meaning |", "|---|---|---|---|", *rows])
         parts.append(f"## {head.rstrip('.').partition(':')[0]}\n\n{head}{paragraph}\n\n{table}\n")
     return "\n".join(parts)
 
@@ -87,7 +87,7 @@ def porting() -> str:
             for theirs, remark in meaning_and_names(function)[1][library]
         ]
         rows.sort(key=lambda row: row[0].lower())
-        table = ["| theirs | ours | differences, owner |", "|---|---|---|", *(row for _, row in rows)]
+        table = ["| their name | ours | differences, owner |", "|---|---|---|", *(row for _, row in rows)]
         parts.append(f"## {title}\n\n" + "\n".join(table) + "\n")
     return "\n".join([*parts, ELSEWHERE_HEAD + ELSEWHERE])
 

@@ -197,5 +197,5 @@ def command_speed(world: int, episodes: EpisodeArrays, command: int) -> float:
 
     mjlab: total_command (inside of its rewards).
     """
-    asked = command_vector(world, episodes, command)
-    return wp.length(wp.vec2(asked[0], asked[1])) + wp.abs(asked[2])
+    commanded = command_vector(world, episodes, command)
+    return wp.length(wp.vec2(commanded[0], commanded[1])) + wp.abs(commanded[2])

@@ -95,7 +95,7 @@ def mean(total: float, count: int) -> float:
 
 @wp.func
 def nearness(distance: float, std: float) -> float:
-    """1 - tanh(distance / std): 1 there, 0 far away."""
+    """1 - tanh(distance / std): 1 at distance 0, 0 far away."""
     return 1.0 - wp.tanh(distance / std)
 
 
@@ -123,7 +123,7 @@ def flag(condition: bool) -> float:
     return wp.where(condition, 1.0, 0.0)
 
 
-def composed(*functions: Any, over: str = "", **filled: Any) -> Callable[[Callable[..., Any]], Any]:
+def composed(*functions: Any, sum_over: str = "", **filled: Any) -> Callable[[Callable[..., Any]], Any]:
     """Make a term of other functions: ``composed(f, g)`` is f(g(...)).
 
     The term has the parameters of the last function, then those of the decorated one, whose body is never run: these are the further
@@ -131,7 +131,7 @@ def composed(*functions: Any, over: str = "", **filled: Any) -> Callable[[Callab
 
     Args:
         functions: Warp functions, each applied to the result of the next.
-        over: An array, such as ``motion.bodies``: the term is the first function of the sum of the others over its elements, and of their
+        sum_over: An array, such as ``motion.bodies``: the term is the first function of the sum of the others over its elements, and of their
             number. The element is the parameter ``index`` or ``joint`` of the last function.
         **filled: Parameters of the last function that other functions compute, which give the term their own parameters instead.
     """
@@ -149,17 +149,17 @@ def composed(*functions: Any, over: str = "", **filled: Any) -> Callable[[Callab
                     each: known for each, known in _parameters(filled[name]).items() if each not in parameters
                 }
                 arguments.append(_call(filled[name], _parameters(filled[name])))
-            elif not (over and name in ("index", "joint")):
+            elif not (sum_over and name in ("index", "joint")):
                 parameters[name] = parameter
             arguments += [] if name in filled else [name]
         own = iter(inspect.signature(declared).parameters.items())
         call, lines = _call(functions[-1], arguments), []
         for position, function in reversed([*enumerate(functions[:-1])]):
             values = [call]
-            if over and position == 0:
+            if sum_over and position == 0:
                 element = "joint" if "joint" in arguments else "index"
-                lines = ["total = float(0.0)", f"for {element} in range({over}.shape[0]):", f"    total += {call}"]
-                values = ["total", f"{over}.shape[0]"]
+                lines = ["total = float(0.0)", f"for {element} in range({sum_over}.shape[0]):", f"    total += {call}"]
+                values = ["total", f"{sum_over}.shape[0]"]
             more = dict(islice(own, len(_parameters(function)) - len(values)))
             parameters |= more
             call = _call(function, [*values, *more])

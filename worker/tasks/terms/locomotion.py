@@ -28,8 +28,8 @@ def track_linear_velocity(
 
     mjlab: track_linear_velocity.
     """
-    asked = command_vector(world, episodes, command)
-    error = root_linear_velocity(world, worlds, robot, bodies) - wp.vec3(asked[0], asked[1], 0.0)
+    commanded = command_vector(world, episodes, command)
+    error = root_linear_velocity(world, worlds, robot, bodies) - wp.vec3(commanded[0], commanded[1], 0.0)
     return likeness(wp.length_sq(error), std)
 
 

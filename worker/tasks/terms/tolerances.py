@@ -79,10 +79,10 @@ def commanded_posture(
 
     mjlab: variable_posture.
     """
-    asked = command_speed(world, episodes, command)
-    if asked < walking:
+    commanded = command_speed(world, episodes, command)
+    if commanded < walking:
         return posture_within(worlds, robot, tolerances.columns, tolerances.standing, world)
-    if asked < running:
+    if commanded < running:
         return posture_within(worlds, robot, tolerances.columns, tolerances.walking, world)
     return posture_within(worlds, robot, tolerances.columns, tolerances.running, world)
 

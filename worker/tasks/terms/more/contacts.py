@@ -62,8 +62,8 @@ def step_time(
 
     Isaac Lab: feet_air_time (target: threshold).
     """
-    asked = wp.vec2(episodes.memory[world, command], episodes.memory[world, command + 1])
-    if wp.length(asked) <= threshold or not first_contact(contacts, world, index):
+    commanded = wp.vec2(episodes.memory[world, command], episodes.memory[world, command + 1])
+    if wp.length(commanded) <= threshold or not first_contact(contacts, world, index):
         return 0.0
     return contacts.last_air_time[world, index] - target
 
@@ -83,7 +83,7 @@ def single_stance_time(
 
     Isaac Lab: feet_air_time_positive_biped (greatest: threshold).
     """
-    asked = wp.vec2(episodes.memory[world, command], episodes.memory[world, command + 1])
+    commanded = wp.vec2(episodes.memory[world, command], episodes.memory[world, command + 1])
     standing = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
     shortest = float(greatest)
     for index in range(contacts.found.shape[1]):
@@ -92,7 +92,7 @@ def single_stance_time(
             standing += 1
             time = contacts.contact_time[world, index]
         shortest = wp.min(shortest, time)
-    if standing != 1 or wp.length(asked) <= threshold:
+    if standing != 1 or wp.length(commanded) <= threshold:
         return 0.0
     return shortest
 

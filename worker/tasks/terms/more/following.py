@@ -31,7 +31,7 @@ from worker.tasks.terms.composing import (
     vertical,
 )
 from worker.tasks.terms.more.motion import MotionArrays
-from worker.tasks.terms.more.tracking import anchor_pose, frame_of, relative_reference, wanted_anchor
+from worker.tasks.terms.more.tracking import anchor_pose, frame_of, reference_anchor, relative_reference
 
 wp.set_module_options({"enable_backward": False})
 
@@ -39,8 +39,8 @@ wp.set_module_options({"enable_backward": False})
 @wp.func
 def _anchor_way(world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, command: int) -> wp.vec3:
     """Vector from the robot's anchor to the motion's, in the world frame [m]."""
-    wanted = wp.transform_get_translation(wanted_anchor(motion, frame_of(episodes, motion, world, command)))
-    return wanted - wp.transform_get_translation(anchor_pose(bodies, motion, world))
+    reference = wp.transform_get_translation(reference_anchor(motion, frame_of(episodes, motion, world, command)))
+    return reference - wp.transform_get_translation(anchor_pose(bodies, motion, world))
 
 
 @wp.func
@@ -49,8 +49,8 @@ def _body_way(
 ) -> wp.vec3:
     """Vector from a body to its relative reference, in the world frame [m]."""
     frame = frame_of(episodes, motion, world, command)
-    wanted = relative_reference(bodies, motion, world, frame, index)
-    return wp.transform_get_translation(wanted) - body_position_of(bodies, world, motion.bodies[index])
+    reference = relative_reference(bodies, motion, world, frame, index)
+    return wp.transform_get_translation(reference) - body_position_of(bodies, world, motion.bodies[index])
 
 
 @wp.func
@@ -59,8 +59,8 @@ def _body_turn(
 ) -> float:
     """Angle between a body and its relative reference [rad]."""
     frame = frame_of(episodes, motion, world, command)
-    wanted = wp.transform_get_rotation(relative_reference(bodies, motion, world, frame, index))
-    return quaternion_error(wanted, body_rotation_of(bodies, world, motion.bodies[index]))
+    reference = wp.transform_get_rotation(relative_reference(bodies, motion, world, frame, index))
+    return quaternion_error(reference, body_rotation_of(bodies, world, motion.bodies[index]))
 
 
 @wp.func
@@ -68,8 +68,8 @@ def _body_way_in_world(
     world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, index: int, command: int
 ) -> wp.vec3:
     """Vector from a body to its position in the motion, in the world frame [m]."""
-    wanted = motion.positions[frame_of(episodes, motion, world, command), index]
-    return wanted - body_position_of(bodies, world, motion.bodies[index])
+    reference = motion.positions[frame_of(episodes, motion, world, command), index]
+    return reference - body_position_of(bodies, world, motion.bodies[index])
 
 
 @wp.func
@@ -77,8 +77,8 @@ def _body_velocity_error(
     world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, index: int, command: int
 ) -> wp.vec3:
     """Difference of the velocity of a body's origin from the motion's, in the world frame [m/s]."""
-    wanted = motion.linear[frame_of(episodes, motion, world, command), index]
-    return body_origin_velocity(bodies, world, motion.bodies[index]) - wanted
+    reference = motion.linear[frame_of(episodes, motion, world, command), index]
+    return body_origin_velocity(bodies, world, motion.bodies[index]) - reference
 
 
 @wp.func
@@ -86,8 +86,8 @@ def _body_turning_error(
     world: int, episodes: EpisodeArrays, bodies: BodyArrays, motion: MotionArrays, index: int, command: int
 ) -> wp.vec3:
     """Difference of a body's angular velocity from the motion's, in the world frame [rad/s]."""
-    wanted = motion.angular[frame_of(episodes, motion, world, command), index]
-    return body_turning(bodies, world, motion.bodies[index]) - wanted
+    reference = motion.angular[frame_of(episodes, motion, world, command), index]
+    return body_turning(bodies, world, motion.bodies[index]) - reference
 
 
 @wp.func
@@ -101,8 +101,8 @@ def _joint_error(
     command: int,
 ) -> float:
     """Difference of a joint's position in the motion from the robot's [m, rad]."""
-    wanted = motion.joint_positions[frame_of(episodes, motion, world, command), joint]
-    return wanted - worlds.joint_q[world, robot.coordinates[joint]]
+    reference = motion.joint_positions[frame_of(episodes, motion, world, command), joint]
+    return reference - worlds.joint_q[world, robot.coordinates[joint]]
 
 
 @wp.func
@@ -116,8 +116,8 @@ def _joint_velocity_error(
     command: int,
 ) -> float:
     """Difference of a joint's velocity in the motion from the robot's [m/s, rad/s]."""
-    wanted = motion.joint_velocities[frame_of(episodes, motion, world, command), joint]
-    return wanted - worlds.joint_qd[world, robot.dofs[joint]]
+    reference = motion.joint_velocities[frame_of(episodes, motion, world, command), joint]
+    return reference - worlds.joint_qd[world, robot.dofs[joint]]
 
 
 @wp.func
@@ -138,8 +138,8 @@ def anchor_turn_error(
 
     mjlab: error_anchor_rot (of MotionCommand). Isaac Lab: error_anchor_rot (of BeyondMimic's MotionCommand).
     """
-    wanted = wp.transform_get_rotation(wanted_anchor(motion, frame_of(episodes, motion, world, command)))
-    return quaternion_error(wanted, wp.transform_get_rotation(anchor_pose(bodies, motion, world)))
+    reference = wp.transform_get_rotation(reference_anchor(motion, frame_of(episodes, motion, world, command)))
+    return quaternion_error(reference, wp.transform_get_rotation(anchor_pose(bodies, motion, world)))
 
 
 @composed(length, _anchor_way)
@@ -166,7 +166,7 @@ def follow_anchor_turn(std: float):
     """
 
 
-@composed(likeness_of_mean, length_squared, _body_way, over="motion.bodies")
+@composed(likeness_of_mean, length_squared, _body_way, sum_over="motion.bodies")
 def follow_body_positions(std: float):
     """exp(-mean of d^2 / std^2), d the distance of each body from its relative reference [m].
 
@@ -174,7 +174,7 @@ def follow_body_positions(std: float):
     """
 
 
-@composed(likeness_of_mean, squared, _body_turn, over="motion.bodies")
+@composed(likeness_of_mean, squared, _body_turn, sum_over="motion.bodies")
 def follow_body_turns(std: float):
     """exp(-mean of a^2 / std^2), a the angle of each body from its relative reference [rad].
 
@@ -182,7 +182,7 @@ def follow_body_turns(std: float):
     """
 
 
-@composed(likeness_of_mean, length_squared, _body_velocity_error, over="motion.bodies")
+@composed(likeness_of_mean, length_squared, _body_velocity_error, sum_over="motion.bodies")
 def follow_body_velocities(std: float):
     """exp(-mean of e^2 / std^2), e the difference of each body's velocity from the motion's, both of its origin in the world frame [m/s].
 
@@ -191,7 +191,7 @@ def follow_body_velocities(std: float):
     """
 
 
-@composed(likeness_of_mean, length_squared, _body_turning_error, over="motion.bodies")
+@composed(likeness_of_mean, length_squared, _body_turning_error, sum_over="motion.bodies")
 def follow_body_turning(std: float):
     """exp(-mean of e^2 / std^2), e the difference of each body's angular velocity from the motion's, in the world frame [rad/s].
 
@@ -225,9 +225,9 @@ def anchor_tilt_off(
     mjlab: bad_anchor_ori. Isaac Lab: bad_anchor_ori (of BeyondMimic).
     """
     up = wp.vec3(0.0, 0.0, 1.0)
-    wanted = wanted_anchor(motion, frame_of(episodes, motion, world, command))
+    reference = reference_anchor(motion, frame_of(episodes, motion, world, command))
     here = wp.transform_vector(anchor_pose(bodies, motion, world), up)[2]
-    return wp.abs(here - wp.transform_vector(wanted, up)[2]) > limit
+    return wp.abs(here - wp.transform_vector(reference, up)[2]) > limit
 
 
 @composed(above, length, _body_way)
@@ -246,12 +246,12 @@ def followed_body_height_off(limit: float):
     """
 
 
-@composed(mean, length, _body_way_in_world, over="motion.bodies")
+@composed(mean, length, _body_way_in_world, sum_over="motion.bodies")
 def mean_body_distance():
     """Mean distance of the bodies from their positions in the motion, in the world frame [m]. mjlab: compute_mpkpe."""
 
 
-@composed(mean, length, _body_way, over="motion.bodies")
+@composed(mean, length, _body_way, sum_over="motion.bodies")
 def mean_relative_body_distance():
     """Mean distance of the bodies from their relative references [m].
 
@@ -260,7 +260,7 @@ def mean_relative_body_distance():
     """
 
 
-@composed(mean, _body_turn, over="motion.bodies")
+@composed(mean, _body_turn, sum_over="motion.bodies")
 def mean_relative_body_turn():
     """Mean angle of the bodies from their relative references [rad].
 
@@ -269,7 +269,7 @@ def mean_relative_body_turn():
     """
 
 
-@composed(_root_of_sum, squared, _joint_error, over="robot.coordinates")
+@composed(_root_of_sum, squared, _joint_error, sum_over="robot.coordinates")
 def joint_position_error_norm():
     """Root of the sum of squares of all joints' distances from the motion [m, rad].
 
@@ -277,6 +277,6 @@ def joint_position_error_norm():
     """
 
 
-@composed(_root_of_mean, squared, _joint_velocity_error, over="robot.dofs")
+@composed(_root_of_mean, squared, _joint_velocity_error, sum_over="robot.dofs")
 def joint_velocity_error():
     """Root of the mean square of all joints' velocity errors [m/s, rad/s]. mjlab: compute_joint_velocity_error."""

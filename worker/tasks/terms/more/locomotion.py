@@ -63,13 +63,13 @@ def velocity_along_command(
     """Velocity of the root's origin in the commanded direction, forward and left, at most the commanded speed [m/s]; 0 for a command to
     stand.
     """
-    asked = wp.vec2(episodes.memory[world, command], episodes.memory[world, command + 1])
+    commanded = wp.vec2(episodes.memory[world, command], episodes.memory[world, command + 1])
     velocity = root_linear_velocity(world, worlds, robot, bodies)
-    along = wp.dot(wp.vec2(velocity[0], velocity[1]), wp.normalize(asked))
-    return wp.min(along, wp.length(asked))
+    along = wp.dot(wp.vec2(velocity[0], velocity[1]), wp.normalize(commanded))
+    return wp.min(along, wp.length(commanded))
 
 
-@composed(likeness_of_mean, joint_deviation_squared, over="robot.defaults")
+@composed(likeness_of_mean, joint_deviation_squared, sum_over="robot.defaults")
 def posture(std: float):
     """exp(-mean of e^2 / std^2) over all joints of the robot, e a joint's distance from its default [rad, m].
 

@@ -139,8 +139,8 @@ def hand_command_turn(
     world: int, worlds: WorldArrays, episodes: EpisodeArrays, robot: RobotArrays, hand: FrameArrays, command: int
 ) -> float:
     """Angle between the hand and the commanded rotation, in [0, pi] [rad]. Isaac Lab: orientation_command_error."""
-    wanted = root_rotation_of(worlds, robot, world) * command_rotation(world, episodes, command)
-    return quaternion_error(wanted, hand.rotations[world, 0])
+    commanded = root_rotation_of(worlds, robot, world) * command_rotation(world, episodes, command)
+    return quaternion_error(commanded, hand.rotations[world, 0])
 
 
 @wp.func
@@ -151,5 +151,5 @@ def object_command_turn(
 
     Isaac Lab: track_orientation_inv_l2 (of in-hand manipulation, which takes the inverse of the angle).
     """
-    wanted = root_rotation_of(worlds, robot, world) * command_rotation(world, episodes, command)
-    return quaternion_error(wanted, root_rotation_of(worlds, other, world))
+    commanded = root_rotation_of(worlds, robot, world) * command_rotation(world, episodes, command)
+    return quaternion_error(commanded, root_rotation_of(worlds, other, world))

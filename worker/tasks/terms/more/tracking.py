@@ -46,7 +46,7 @@ def anchor_pose(bodies: BodyArrays, motion: MotionArrays, world: int) -> wp.tran
 
 
 @wp.func
-def wanted_anchor(motion: MotionArrays, frame: int) -> wp.transform:
+def reference_anchor(motion: MotionArrays, frame: int) -> wp.transform:
     """Pose of the motion's anchor, in the world frame."""
     return wp.transform(motion.positions[frame, motion.anchor], motion.rotations[frame, motion.anchor])
 
@@ -54,11 +54,11 @@ def wanted_anchor(motion: MotionArrays, frame: int) -> wp.transform:
 @wp.func
 def relative_reference(bodies: BodyArrays, motion: MotionArrays, world: int, frame: int, index: int) -> wp.transform:
     """Relative reference of a body, in the world frame, with the motion's height of the anchor."""
-    anchor, wanted = anchor_pose(bodies, motion, world), wanted_anchor(motion, frame)
-    between_both = wp.transform_get_rotation(anchor) * wp.quat_inverse(wp.transform_get_rotation(wanted))
+    anchor, reference = anchor_pose(bodies, motion, world), reference_anchor(motion, frame)
+    between_both = wp.transform_get_rotation(anchor) * wp.quat_inverse(wp.transform_get_rotation(reference))
     turn = yaw_quaternion(between_both)
     place = wp.transform_get_translation(anchor)
-    origin = wp.transform_get_translation(wanted)
+    origin = wp.transform_get_translation(reference)
     place = wp.vec3(place[0], place[1], origin[2])
     position = place + wp.quat_rotate(turn, motion.positions[frame, index] - origin)
     return wp.transform(position, turn * motion.rotations[frame, index])
@@ -116,8 +116,8 @@ def motion_command(
     set_root_velocity(worlds, robot, bodies, world, linear, angular)
     for joint in range(robot.defaults.shape[0]):
         offset = between(stream, 13 + joint, wp.vec2(-joints, joints))
-        there = within_limits(robot, joint, motion.joint_positions[frame, joint] + offset, soft_factor)
-        set_joint(worlds, robot, world, joint, there, motion.joint_velocities[frame, joint])
+        target = within_limits(robot, joint, motion.joint_positions[frame, joint] + offset, soft_factor)
+        set_joint(worlds, robot, world, joint, target, motion.joint_velocities[frame, joint])
 
 
 @needs(command=1)
@@ -173,9 +173,9 @@ def wanted_anchor_position(
 
     mjlab: motion_anchor_pos_b. Isaac Lab: motion_anchor_pos_b (of BeyondMimic).
     """
-    wanted = wanted_anchor(motion, frame_of(episodes, motion, world, command))
+    reference = reference_anchor(motion, frame_of(episodes, motion, world, command))
     return wp.transform_point(
-        wp.transform_inverse(anchor_pose(bodies, motion, world)), wp.transform_get_translation(wanted)
+        wp.transform_inverse(anchor_pose(bodies, motion, world)), wp.transform_get_translation(reference)
     )
 
 
@@ -188,9 +188,9 @@ def wanted_anchor_turn(
 
     mjlab: motion_anchor_ori_b. Isaac Lab: motion_anchor_ori_b (of BeyondMimic).
     """
-    wanted = wp.transform_get_rotation(wanted_anchor(motion, frame_of(episodes, motion, world, command)))
+    reference = wp.transform_get_rotation(reference_anchor(motion, frame_of(episodes, motion, world, command)))
     robot_turn = wp.transform_get_rotation(anchor_pose(bodies, motion, world))
-    return turn_element(wp.quat_inverse(robot_turn) * wanted, index)
+    return turn_element(wp.quat_inverse(robot_turn) * reference, index)
 
 
 @wp.func
