@@ -26,6 +26,8 @@ MODULES = {
     "values, and what makes or shows them": "job snapshot",
     "the same kind of thing in separate rooms": "catalogue episodes errors networks picture progress reasons requests",
     "the name by which engines start it, and the program": "supervisor",
+    "terms that shipped tasks use, and the others of the same group": """
+        bodies commands contacts episode events ground joints locomotion manipulation root sensing""",
 }
 """Names of several modules: by what makes their meaning one."""
 

@@ -19,6 +19,7 @@ from docs.tools.terms_pages import porting, reference
 from tests.conftest import REPOSITORY
 from worker.simulation.declared_randomization import QUANTITIES
 from worker.tasks import terms
+from worker.tasks.declare.term_needs import needs_of
 from worker.tasks.terms.aliases import ELSEWHERE, LIBRARIES, aliases, all_terms, meaning_and_names
 
 HELPERS = ("resolve_env_ids",)
@@ -61,6 +62,25 @@ def test_terms_that_no_shipped_task_uses_are_imported_when_one_is_used_and_an_un
     assert result.stdout.splitlines()[-1] == "[] joint_power True"
     with pytest.raises(AttributeError, match=r"there is no term 'joint_powr'; did you mean joint_power\?"):
         _ = terms.joint_powr
+
+
+def test_a_composed_term_is_a_function_of_its_parts_whose_source_says_no_more_so_that_its_kernels_are_cached() -> None:
+    upright, reset, posture = (getattr(terms, name).func for name in ("upright", "reset_root_on_terrain", "posture"))
+    assert inspect.getsource(upright) == (
+        "def upright(world: int, worlds: WorldArrays, robot: RobotArrays, std: float) -> float:\n"
+        "    return of_likeness(of_tilt_squared(world, worlds, robot), std)\n"
+    )
+    assert list(inspect.signature(reset).parameters)[:7] == [
+        "world",
+        "worlds",
+        "robot",
+        "bodies",
+        "terrain",
+        "stream",
+        "x",
+    ]
+    assert reset.__defaults__ == (wp.vec2(0.0, 0.0),) * 12 and needs_of(terms.reset_root_on_terrain).free_root
+    assert "for joint in range(robot.defaults.shape[0]):" in inspect.getsource(posture)
 
 
 @pytest.mark.parametrize("library", LIBRARIES)

@@ -1,3 +1,4 @@
+# ruff: noqa: F403
 """Named terms for declared tasks: small Warp functions for actions, observations, rewards, terminations, commands and events.
 
 A task uses them as ``terms.NAME``. Those that no shipped task needs are in :mod:`worker.tasks.terms.more`, which is imported when one
@@ -8,13 +9,44 @@ from __future__ import annotations
 
 from importlib import import_module
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import warp as wp
 
 from shared_store.contract.error_text import nearest
 from worker.tasks.terms.tolerances import ToleranceArrays as ToleranceArrays
 from worker.tasks.terms.tolerances import Tolerances as Tolerances
+
+if TYPE_CHECKING:  # what an editor completes
+    from worker.tasks.terms.actions import *
+    from worker.tasks.terms.bodies import *
+    from worker.tasks.terms.commands import *
+    from worker.tasks.terms.contacts import *
+    from worker.tasks.terms.episode import *
+    from worker.tasks.terms.events import *
+    from worker.tasks.terms.footing import *
+    from worker.tasks.terms.ground import *
+    from worker.tasks.terms.joints import *
+    from worker.tasks.terms.locomotion import *
+    from worker.tasks.terms.manipulation import *
+    from worker.tasks.terms.more import *
+    from worker.tasks.terms.more.actions import *
+    from worker.tasks.terms.more.bodies import *
+    from worker.tasks.terms.more.commands import *
+    from worker.tasks.terms.more.contacts import *
+    from worker.tasks.terms.more.episode import *
+    from worker.tasks.terms.more.events import *
+    from worker.tasks.terms.more.following import *
+    from worker.tasks.terms.more.ground import *
+    from worker.tasks.terms.more.joints import *
+    from worker.tasks.terms.more.locomotion import *
+    from worker.tasks.terms.more.manipulation import *
+    from worker.tasks.terms.more.root import *
+    from worker.tasks.terms.more.sensing import *
+    from worker.tasks.terms.more.tracking import *
+    from worker.tasks.terms.root import *
+    from worker.tasks.terms.selecting import *
+    from worker.tasks.terms.sensing import *
 
 GROUPS = (
     *("joints", "root", "bodies", "actions", "commands", "events", "episode", "locomotion", "tolerances"),
