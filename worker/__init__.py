@@ -22,6 +22,10 @@ OLD_NAMES = {
     "worker.tasks.racer": "racer.car.task",
     "worker.tasks.rsl_rl_env": "worker.learning.rsl.vector_environment",
     "worker.tasks.task": "worker.tasks.run.task",
+    "worker.tasks.terms.following": "worker.tasks.terms.more.following",
+    "worker.tasks.terms.frame_sampling": "worker.tasks.terms.more.frame_sampling",
+    "worker.tasks.terms.motion": "worker.tasks.terms.more.motion",
+    "worker.tasks.terms.tracking": "worker.tasks.terms.more.tracking",
 }
 """Names in the documentation before the modules moved into rooms."""
 keep_old_names(OLD_NAMES)

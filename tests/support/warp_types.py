@@ -2,7 +2,7 @@
 
 Warp compiles the body of a ``@wp.func`` or ``@wp.kernel`` from its syntax tree, by rules that are not Python's: operators of
 vectors, conversions of numbers, ``wp.tid()``. So mypy sees neither body nor signature: each such function is declared as the
-``wp.Function`` or ``wp.Kernel`` that the decorator makes of it.
+``wp.Function`` or ``wp.Kernel`` that the decorator makes of it. A term that is ``@composed`` of others has no body at all.
 
 The types of Warp and Newton leave four things open, which are closed here:
 
@@ -22,9 +22,9 @@ from mypy import nodes, types
 from mypy.plugin import AnalyzeTypeContext, AttributeContext, FunctionContext, Plugin, ReportConfigContext
 from mypy.types_utils import remove_optional
 
-MADE = {"func": "Function", "func_native": "Function", "kernel": "Kernel"}
+MADE = {"func": "Function", "func_native": "Function", "kernel": "Kernel", "composed": "Function"}
 """Class of what each decorator makes."""
-KERNEL = re.compile(rb"@\w+\.(func|func_native|kernel)\b")
+KERNEL = re.compile(rb"@(\w+\.(func|func_native|kernel)|composed)\b")
 ARRAY = "warp._src.types.array"
 COPIED = re.compile(r"warp\.((vec[234]|mat(22|33|44)|quat|transform)f)")
 FILLED = ("newton._src.sim.model.Model.", "newton._src.sim.state.State.")
@@ -74,12 +74,17 @@ def _declared(statement: nodes.Statement) -> nodes.Statement:
     for decorator in statement.original_decorators:
         called = decorator.callee if isinstance(decorator, nodes.CallExpr) else decorator
         if isinstance(called, nodes.MemberExpr) and isinstance(called.expr, nodes.NameExpr) and called.name in MADE:
-            kind = types.UnboundType(f"{called.expr.name}.{MADE[called.name]}", line=statement.line)
-            nothing = nodes.TempNode(types.AnyType(types.TypeOfAny.special_form), no_rhs=True)
-            declared = nodes.AssignmentStmt([nodes.NameExpr(statement.name)], nothing, kind, new_syntax=True)
-            for node in (declared, *declared.lvalues, nothing):
-                node.set_line(statement)
-            return declared
+            module = called.expr.name
+        elif isinstance(called, nodes.NameExpr) and called.name == "composed":
+            module = "wp"
+        else:
+            continue
+        kind = types.UnboundType(f"{module}.{MADE[called.name]}", line=statement.line)
+        nothing = nodes.TempNode(types.AnyType(types.TypeOfAny.special_form), no_rhs=True)
+        declared = nodes.AssignmentStmt([nodes.NameExpr(statement.name)], nothing, kind, new_syntax=True)
+        for node in (declared, *declared.lvalues, nothing):
+            node.set_line(statement)
+        return declared
     return statement
 
 

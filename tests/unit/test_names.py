@@ -24,8 +24,11 @@ MODULES = {
         engine gang gangs node request""",
     "a contract, and those who keep it": "algorithm bus policy",
     "values, and what makes or shows them": "job snapshot",
-    "the same kind of thing in separate rooms": "catalogue episodes errors networks picture progress reasons requests",
+    "the same kind of thing in separate rooms": "episodes errors networks picture progress reasons requests",
     "the name by which engines start it, and the program": "supervisor",
+    "what comes from another library: its robots, and its names of terms": "mjlab",
+    "terms that shipped tasks use, and the others of the same group": """
+        bodies commands contacts episode events ground joints locomotion manipulation root sensing""",
 }
 """Names of several modules: by what makes their meaning one."""
 

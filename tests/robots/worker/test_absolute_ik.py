@@ -21,7 +21,6 @@ from tests.robots.worker.test_differential_ik import (
     Planar,
     Skew,
     asked,
-    continues_alike,
     damped,
     jacobian,
     made,
@@ -148,31 +147,6 @@ def test_one_action_held_brings_the_tip_to_its_place_seen_from_a_root_that_is_tu
     found = asked(task, positions, np.tile([*aim, 0.0], (2, 1)), joints=[7, 8, 9])[:, :2]
     expected = damped(tip_jacobian(), (-0.02, 0.01), damping=0.02)
     np.testing.assert_allclose(found, np.tile(expected, (2, 1)), atol=1e-4)
-
-
-class HeavyPoint(Point):
-    """The planar arm upright, whose weight pulls it down."""
-
-    text = PLANAR.replace('gravity="0 0 0"', 'gravity="0 0 -9.81"').replace('axis="0 0 1"', 'axis="0 -1 0"')
-    ik = replace(Point.ik, axes=("x", "z"))
-
-
-def test_an_arm_that_is_told_a_place_sinks_once_and_no_further() -> None:
-    task = made(HeavyPoint, worlds=1)
-    aim = tip(task.observations[0].tolist())
-    heights = []
-    for _ in range(80):
-        task.step(torch.tensor([[*aim, 0.0]], dtype=torch.float32))
-        heights.append(tip(task.observations[0].tolist())[1])
-    assert heights[-1] == pytest.approx(heights[39], abs=1e-4)
-    assert 0.0 < aim[1] - heights[-1] < 0.03
-
-
-def test_a_state_goes_on_bit_for_bit() -> None:
-    one, other = made(Posed), made(Posed)
-    place, turn = palm(GOALS[0])
-    action = torch.tensor([[*place, *xyzw(turn)]] * 2, dtype=torch.float32)
-    assert continues_alike(one, other, action)
 
 
 def test_the_contract_names_numbers_of_a_pose_and_their_units() -> None:

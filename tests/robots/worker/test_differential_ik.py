@@ -214,21 +214,6 @@ def tip_jacobian() -> np.ndarray:
     return np.array([[-y, elbow_y - y], [x, x - elbow_x]])
 
 
-def test_small_steps_move_the_tip_where_they_say() -> None:
-    """The policy of this test asks each step for what is left of the way, as far as an action of 1 goes."""
-    task = made(Planar, damping=0.02)
-    begin = tip([0.4, 0.9])
-    aims = begin + np.array([[-0.15, 0.1], [0.08, -0.2]])
-    scale, errors = np.array([0.02, 0.01]), []
-    for _ in range(60):
-        places = np.array([tip(row) for row in task.observations.numpy()])
-        errors.append(np.linalg.norm(aims - places, axis=1))
-        actions = np.concatenate((np.clip((aims - places) / scale, -1.0, 1.0), np.zeros((2, 1))), axis=1)
-        task.step(torch.tensor(actions, dtype=torch.float32))
-    assert (errors[0] > 0.15).all() and (errors[-1] < 0.002).all()
-    assert (errors[20] < 0.75 * errors[0]).all()
-
-
 class Heavy(Planar):
     """The planar arm upright: its joints turn about -y, from x to z, and its weight pulls it down."""
 

@@ -12,6 +12,7 @@ import torch
 import warp as wp
 import yaml
 
+from docs.tools.settings_page import sketch
 from tests.conftest import REPOSITORY
 from tests.support.worker.page_tasks import blocks, module
 from tests.support.worker.robots import need_mjlab
@@ -20,7 +21,6 @@ from worker.learning.job import configure
 from worker.settings.velocity import Go1FlatConfig
 from worker.tasks import find_task
 from worker.tasks.run.declared import DeclaredTask
-from worker.tasks.settings_page import sketch
 
 SIZES = re.compile(r"(\d+) observations, (\d+) actions?")
 

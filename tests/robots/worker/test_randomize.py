@@ -257,16 +257,6 @@ def test_limits_of_a_urdf_joint_stay_as_stiff_when_masses_change() -> None:
     np.testing.assert_allclose(got, worlds.solver.mjw_model.jnt_solref.numpy(), rtol=1e-4)
 
 
-def test_without_entries_there_is_no_state_and_nothing_to_do() -> None:
-    worlds, view = build_arm()
-    own = fields(worlds)
-    randomizations = randomize({}, worlds, view)
-    randomizations.settle()
-    randomizations.apply()
-    assert randomizations.state_tensors() == {} == randomizations.numbers()
-    np.testing.assert_array_equal(fields(worlds)["body_mass"], own["body_mass"])
-
-
 def reference_weights(model: mujoco.MjModel, factors: np.ndarray) -> dict[str, np.ndarray]:
     model.body_mass[1:] *= factors
     model.body_inertia[1:] *= factors[:, None]

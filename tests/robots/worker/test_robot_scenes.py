@@ -236,20 +236,6 @@ def test_masks_of_a_file_give_way_to_those_declared():
     assert frozenset("ab") in pairs_that_touch(Robot(apart, actuators=(SERVO,), collisions=(Collision("*"),)))
 
 
-def test_ground_and_objects_need_no_shape_of_the_builder_to_be_marked():
-    """A world that was built by hand, without masks, is left to Newton."""
-
-    class ByHand:
-        def add_to(self, template):
-            body = template.add_link(label="hand/hand")
-            template.add_shape_sphere(body, radius=0.1)
-            template.add_articulation([template.add_joint_free(body)], label="hand")
-
-    arm = Robot(ARM, actuators=(SERVO,))
-    _, worlds = build(arm, ByHand())
-    assert worlds.solver.mj_model.ngeom == 5
-
-
 @pytest.fixture(params=["Go1Flat", "G1Flat"])
 def robot(request: pytest.FixtureRequest) -> Robot:
     """Of that task."""

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import yaml
 
+from docs.tools.settings_page import FAMILIES, MJLAB, page, sketch
 from tests.conftest import REPOSITORY
 from tests.support.worker.robots import needs_mjlab
 from worker.tasks.run.find import BUILT_IN
-from worker.tasks.settings_page import FAMILIES, MJLAB, page, sketch
 
 pytestmark = needs_mjlab
 LIMITS = ("iterations", "ls_iterations", "nconmax", "njmax")

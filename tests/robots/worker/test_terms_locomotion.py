@@ -20,7 +20,7 @@ from worker.simulation.sensors.imu import ImuArrays
 from worker.simulation.sensors.momentum import MomentumArrays
 from worker.simulation.sensors.rays import RayArrays
 from worker.simulation.terrain_arrays import TerrainArrays
-from worker.tasks.terms import contacts, ground, locomotion, sensing, tolerances
+from worker.tasks.terms.tolerances import ToleranceArrays, Tolerances
 
 FEET, POINTS, COMMAND = 4, 6, 10
 near = partial(close, rtol=2e-4, atol=3e-5)
@@ -62,21 +62,23 @@ def structs() -> dict[Any, Any]:
     slope = 0.3 * np.arange(13) - 1.8  # height = 0.3 (x + 6) - 1.8 = 0.3 x along x, whatever y
     terrain.heights = array(np.tile(slope, (13, 1)))
     terrain.corner, terrain.size, terrain.resolution = wp.vec2(-6.0, -6.0), wp.vec2(2.0, 3.0), 1.0
-    allowed = tolerances.ToleranceArrays()
+    allowed = ToleranceArrays()
     allowed.columns = array([0, 3], wp.int32)
     allowed.standing, allowed.walking, allowed.running = array([0.5, 1.0]), array([1.0, 2.0]), array([3.0, 4.0])
     rays = RayArrays()
     rays.distances = array(random.uniform(0.1, 5.0, (WORLDS, POINTS)))
     found = (arrays, frames, imu, momentum, scan, terrain, rays, allowed)
     kinds = (ContactArrays, FrameArrays, ImuArrays, MomentumArrays, HeightScanArrays, TerrainArrays, RayArrays)
-    return dict(zip((*kinds, tolerances.ToleranceArrays), found, strict=True))
+    return dict(zip((*kinds, ToleranceArrays), found, strict=True))
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Rig:
-    shared = ("touches", "planar_speed", "above_ground", "posture_within")
-    functions = terms_of(contacts, ground, locomotion, sensing, tolerances, without=shared)
-    made = Rig(functions, tmp_path_factory.mktemp("locomotion"), structs())
+    made = Rig(
+        terms_of("contacts", "ground", "locomotion", "sensing", "tolerances"),
+        tmp_path_factory.mktemp("locomotion"),
+        structs(),
+    )
     values = made.episodes.memory.numpy()
     values[:, COMMAND : COMMAND + 3] = [[0.3, -0.4, 0.2], [0.0, 0.0, 0.04], [1.2, 0.5, 0.9]]  # walk, nearly stand, run
     made.episodes.memory.assign(values)
@@ -102,33 +104,33 @@ def test_tracking_rewards_and_errors(rig: Rig) -> None:
         "track_turning_velocity": (r.own_angular[:, 2] - asked[:, 2]) ** 2,
         "track_turning_velocity_in_world": (r.angular[:, 2] - asked[:, 2]) ** 2,
     }.items():
-        near(rig.call(getattr(locomotion, name), command=COMMAND, std=1.5), np.exp(-error / 2.25), name)
+        near(rig.call(name, command=COMMAND, std=1.5), np.exp(-error / 2.25), name)
     near(
-        rig.call(locomotion.planar_velocity_error, command=COMMAND),
+        rig.call("planar_velocity_error", command=COMMAND),
         np.linalg.norm((r.own_origin - asked)[:, :2], axis=1),
     )
-    near(rig.call(locomotion.turning_velocity_error, command=COMMAND), np.abs(r.own_angular[:, 2] - asked[:, 2]))
+    near(rig.call("turning_velocity_error", command=COMMAND), np.abs(r.own_angular[:, 2] - asked[:, 2]))
     length = np.linalg.norm(planar, axis=1)
     along = np.where(length > 0, (r.own_origin * planar).sum(1) / np.maximum(length, 1e-9), 0)
-    near(rig.call(locomotion.velocity_along_command, command=COMMAND), np.minimum(along, length))
-    near(rig.call(locomotion.heading_error, command=COMMAND), np.abs(asked[:, 2]))
-    near(rig.call(locomotion.distance_left, command=COMMAND), length)
-    near(rig.call(locomotion.near_place, command=COMMAND, std=0.4), 1 - np.tanh(length / 0.4))
+    near(rig.call("velocity_along_command", command=COMMAND), np.minimum(along, length))
+    near(rig.call("heading_error", command=COMMAND), np.abs(asked[:, 2]))
+    near(rig.call("distance_left", command=COMMAND), length)
+    near(rig.call("near_place", command=COMMAND, std=0.4), 1 - np.tanh(length / 0.4))
 
 
 def test_posture(rig: Rig) -> None:
     offsets = rig.q[:, rig.robot.coordinates.numpy()] - rig.robot.defaults.numpy()
-    near(rig.call(locomotion.posture, std=1.2), np.exp(-(offsets**2).mean(1) / 1.44))
+    near(rig.call("posture", std=1.2), np.exp(-(offsets**2).mean(1) / 1.44))
     for joint in range(JOINTS):
-        found = rig.call(locomotion.deviation_when_standing, joint, command=COMMAND)
+        found = rig.call("deviation_when_standing", joint, command=COMMAND)
         near(found, np.abs(offsets[:, joint]) * [0, 1, 0])
     r = rig.root()
     moves = (r.origin**2).sum(1) + (r.angular**2).sum(1)
-    near(rig.call(locomotion.motion_when_standing, command=COMMAND), moves * [0, 1, 0])
+    near(rig.call("motion_when_standing", command=COMMAND), moves * [0, 1, 0])
     two = offsets[:, [0, 3]]
-    near(rig.call(tolerances.tolerant_posture), np.exp(-((two / [0.5, 1.0]) ** 2).mean(1)))
+    near(rig.call("tolerant_posture"), np.exp(-((two / [0.5, 1.0]) ** 2).mean(1)))
     allowed = np.array([[1.0, 2.0], [0.5, 1.0], [3.0, 4.0]])
-    near(rig.call(tolerances.commanded_posture, command=COMMAND), np.exp(-((two / allowed) ** 2).mean(1)))
+    near(rig.call("commanded_posture", command=COMMAND), np.exp(-((two / allowed) ** 2).mean(1)))
 
 
 def test_contacts(rig: Rig) -> None:
@@ -163,21 +165,21 @@ def test_contacts(rig: Rig) -> None:
             ("contact_force_excess", np.maximum(peaks - 2, 0), {"force": 2.0}),
             ("illegal_contact", history.max(-1) > 18, {"force": 18.0}),
         ):
-            near(rig.call(getattr(contacts, name), foot, **numbers), wanted[:, foot], name)
-        near(rig.call(contacts.contact_force, foot), force[:, foot])
-        near(rig.call(contacts.contact_force_logarithm, foot), (np.sign(force) * np.log1p(np.abs(force)))[:, foot])
-    near(rig.call(contacts.hard_contact_steps, force=18.0), (history.max(1) > 18).sum(-1))
-    near(rig.call(contacts.no_contact, force=3.0), ~(peaks > 3).any(1))
+            near(rig.call(name, foot, **numbers), wanted[:, foot], name)
+        near(rig.call("contact_force", foot), force[:, foot])
+        near(rig.call("contact_force_logarithm", foot), (np.sign(force) * np.log1p(np.abs(force)))[:, foot])
+    near(rig.call("hard_contact_steps", force=18.0), (history.max(1) > 18).sum(-1))
+    near(rig.call("no_contact", force=3.0), ~(peaks > 3).any(1))
     times = np.where(touch, c.contact_time.numpy(), air).min(1)
     alone = (touch.sum(1) == 1) & asks[:, 0]
     assert alone.any() and not alone.all()
-    near(rig.call(contacts.single_stance_time, command=COMMAND, greatest=0.3), alone * np.minimum(times, 0.3))
+    near(rig.call("single_stance_time", command=COMMAND, greatest=0.3), alone * np.minimum(times, 0.3))
 
 
 @pytest.mark.parametrize("where", ["flat", "terrain"])
 def test_the_greatest_height_of_a_swing_counts_at_touchdown(rig: Rig, where: str) -> None:
     c, f = rig.structs[ContactArrays], rig.structs[FrameArrays]
-    term = contacts.swing_height_error if where == "flat" else ground.swing_height_error_above_ground
+    term = "swing_height_error" if where == "flat" else "swing_height_error_above_ground"
     numbers = {"command": COMMAND, "memory": 20, "height": 0.1}
     values = rig.episodes.memory.numpy()
     values[:, 20:24] = 0.0
@@ -199,66 +201,66 @@ def test_the_greatest_height_of_a_swing_counts_at_touchdown(rig: Rig, where: str
 def test_sensors(rig: Rig) -> None:
     imu, frames, momentum = rig.structs[ImuArrays], rig.structs[FrameArrays], rig.structs[MomentumArrays]
     turn = matrix(imu.rotations.numpy())
-    near(rig.call(sensing.imu_angular_velocity), imu.gyro.numpy())
-    near(rig.call(sensing.imu_linear_velocity), imu.velocimeter.numpy())
-    near(rig.call(sensing.imu_acceleration), imu.accelerometer.numpy())
-    near(rig.call(sensing.imu_projected_gravity), -turn[:, 2, :])
-    near(rig.call(sensing.imu_acceleration_squared), ((imu.accelerometer.numpy() - 9.81 * turn[:, 2, :]) ** 2).sum(1))
-    near(matrix(rig.call(sensing.imu_orientation)), turn)
+    near(rig.call("imu_angular_velocity"), imu.gyro.numpy())
+    near(rig.call("imu_linear_velocity"), imu.velocimeter.numpy())
+    near(rig.call("imu_acceleration"), imu.accelerometer.numpy())
+    near(rig.call("imu_projected_gravity"), -turn[:, 2, :])
+    near(rig.call("imu_acceleration_squared"), ((imu.accelerometer.numpy() - 9.81 * turn[:, 2, :]) ** 2).sum(1))
+    near(matrix(rig.call("imu_orientation")), turn)
     turns = matrix(frames.rotations.numpy())
     for column in range(FEET):
-        near(rig.call(sensing.frame_position, column), frames.positions.numpy()[:, column])
-        near(rig.call(sensing.frame_height, column), frames.positions.numpy()[:, column, 2])
-        near(matrix(rig.call(sensing.frame_orientation, column)), turns[:, column])
-        near(rig.call(sensing.frame_linear_velocity, column), frames.linear.numpy()[:, column])
-        near(rig.call(sensing.frame_angular_velocity, column), frames.angular.numpy()[:, column])
+        near(rig.call("frame_position", column), frames.positions.numpy()[:, column])
+        near(rig.call("frame_height", column), frames.positions.numpy()[:, column, 2])
+        near(matrix(rig.call("frame_orientation", column)), turns[:, column])
+        near(rig.call("frame_linear_velocity", column), frames.linear.numpy()[:, column])
+        near(rig.call("frame_angular_velocity", column), frames.angular.numpy()[:, column])
         own = np.einsum("wji,wj->wi", turns[:, column], frames.linear.numpy()[:, column])
-        near(rig.call(sensing.frame_velocity_in_own_frame, column), own)
+        near(rig.call("frame_velocity_in_own_frame", column), own)
     for index in range(6):
-        near(rig.call(sensing.frame_orientation_element, index), turns[:, 0, :, :2].reshape(WORLDS, 6)[:, index])
-    near(rig.call(sensing.angular_momentum), momentum.angular.numpy())
-    near(rig.call(sensing.angular_momentum_squared), (momentum.angular.numpy() ** 2).sum(1))
-    near(rig.call(sensing.center_of_mass_velocity), momentum.velocities.numpy())
-    near(rig.call(sensing.center_of_mass), momentum.centers.numpy())
+        near(rig.call("frame_orientation_element", index), turns[:, 0, :, :2].reshape(WORLDS, 6)[:, index])
+    near(rig.call("angular_momentum"), momentum.angular.numpy())
+    near(rig.call("angular_momentum_squared"), (momentum.angular.numpy() ** 2).sum(1))
+    near(rig.call("center_of_mass_velocity"), momentum.velocities.numpy())
+    near(rig.call("center_of_mass"), momentum.centers.numpy())
     distances = rig.structs[RayArrays].distances.numpy()
-    near(rig.call(sensing.ray_distance, 1), distances[:, 1])
-    near(rig.call(sensing.nearest_obstacle), distances.min(1))
+    near(rig.call("ray_distance", 1), distances[:, 1])
+    near(rig.call("nearest_obstacle"), distances.min(1))
 
 
 def test_the_ground(rig: Rig) -> None:
     scan, terrain, frames = rig.structs[HeightScanArrays], rig.structs[TerrainArrays], rig.structs[FrameArrays]
     heights, here = scan.heights.numpy(), rig.q[:, ROOT : ROOT + 3].astype(float)
-    near(rig.call(ground.scanned_height, 4, offset=0.5), heights[:, 4] - 0.5)
-    near(rig.call(ground.scanned_height_mean), heights.mean(1))
-    near(rig.call(ground.scanned_height_error_squared, target=0.3), (heights.mean(1) - 0.3) ** 2)
+    near(rig.call("scanned_height", 4, offset=0.5), heights[:, 4] - 0.5)
+    near(rig.call("scanned_height_mean"), heights.mean(1))
+    near(rig.call("scanned_height_error_squared", target=0.3), (heights.mean(1) - 0.3) ** 2)
     r, wanted = rig.root(), []
     for world, points in enumerate(scan.points.numpy().astype(float)):
         a, b, _ = np.linalg.lstsq(np.column_stack([points[:, :2], np.ones(POINTS)]), points[:, 2], rcond=None)[0]
         local = r.turn[world].T @ (np.array([-a, -b, 1]) / np.sqrt(a * a + b * b + 1))
         wanted.append(np.exp(-(local[:2] ** 2).sum() / 0.64))
-    near(rig.call(ground.upright_on_ground, std=0.8), wanted)
+    near(rig.call("upright_on_ground", std=0.8), wanted)
     above = here[:, 2] - 0.3 * here[:, 0]
-    near(rig.call(ground.height_above_ground), above)
-    near(rig.call(ground.too_low_above_ground, height=float(np.median(above))), above < np.median(above))
+    near(rig.call("height_above_ground"), above)
+    near(rig.call("too_low_above_ground", height=float(np.median(above))), above < np.median(above))
     feet = frames.positions.numpy()
     clear = feet[..., 2] - 0.3 * feet[..., 0]
     speed = np.linalg.norm(frames.linear.numpy()[..., :2], axis=-1)
     for foot in range(FEET):
-        near(rig.call(ground.frame_height_above_ground, foot), clear[:, foot])
-        found = rig.call(ground.foot_clearance_above_ground, foot, command=COMMAND, height=0.1, threshold=0.1)
+        near(rig.call("frame_height_above_ground", foot), clear[:, foot])
+        found = rig.call("foot_clearance_above_ground", foot, command=COMMAND, height=0.1, threshold=0.1)
         near(found, np.abs(clear[:, foot] - 0.1) * speed[:, foot] * [1, 0, 1])
-    near(rig.call(ground.terrain_level), [0, 1, 1])
+    near(rig.call("terrain_level"), [0, 1, 1])
     way = here - terrain.origins.numpy()[[0, 1, 1], [2, 0, 1]]
     beyond = (np.abs(way[:, 0]) > 0.3) | (np.abs(way[:, 1]) > 0.45)
     assert beyond.any()
-    near(rig.call(ground.left_patch, share=0.3), beyond & [False, True, True])  # the first has just begun
-    near(rig.call(ground.left_terrain, margin=-5.5), (np.abs(here[:, :2]) > 0.5).any(1))
+    near(rig.call("left_patch", share=0.3), beyond & [False, True, True])  # the first has just begun
+    near(rig.call("left_terrain", margin=-5.5), (np.abs(here[:, :2]) > 0.5).any(1))
 
 
 def test_worlds_are_placed_on_their_patch_and_walk_to_others(rig: Rig) -> None:
     terrain = rig.structs[TerrainArrays]
     origins = terrain.origins.numpy()
-    rig.call(ground.reset_root_on_terrain, x=(0.5, 0.5))
+    rig.call("reset_root_on_terrain", x=(0.5, 0.5))
     places = rig.worlds.joint_q.numpy()[:, ROOT : ROOT + 3]
     start = np.array(rig.robot.start)[:3]
     near(places, start + origins[[0, 1, 1], [2, 0, 1]] + [0.5, 0, 0])
@@ -269,11 +271,11 @@ def test_worlds_are_placed_on_their_patch_and_walk_to_others(rig: Rig) -> None:
     now = rig.worlds.joint_q.numpy()
     now[:, ROOT : ROOT + 3] = origins[[0, 1, 1], [2, 0, 1]] + [[1.5, 0, 0], [0, 0.1, 0], [0, 0.1, 0]]
     rig.worlds.joint_q.assign(now)
-    rig.call(ground.walk_to_levels, command=COMMAND, episode_seconds=2.0)
+    rig.call("walk_to_levels", command=COMMAND, episode_seconds=2.0)
     assert terrain.levels.numpy().tolist() == [1, 0, 1]
     seen = set()
     for seed in range(40):
-        rig.call(ground.draw_patch, stream=seed)
+        rig.call("draw_patch", stream=seed)
         seen |= set(zip(terrain.levels.numpy().tolist(), terrain.kinds.numpy().tolist(), strict=True))
     assert seen == {(level, kind) for level in range(2) for kind in range(3)}
 
@@ -282,7 +284,7 @@ def test_tolerances_by_pattern() -> None:
     names = ["left_hip", "left_knee", "right_hip", "right_knee", "waist"]
     view = SimpleNamespace(joint_names=names)
     context: Any = SimpleNamespace(device="cpu", view=lambda name, what: view)
-    built = tolerances.Tolerances(standing={"*_hip": 0.1, "left_*": 0.2, "right_knee": 0.3}, running=0.9).build(context)
+    built = Tolerances(standing={"*_hip": 0.1, "left_*": 0.2, "right_knee": 0.3}, running=0.9).build(context)
     assert built.names == ("left_hip", "left_knee", "right_hip", "right_knee")
     assert built.arrays.columns.numpy().tolist() == [0, 1, 2, 3]
     near(built.arrays.standing.numpy(), [0.1, 0.2, 0.1, 0.3])
@@ -293,7 +295,7 @@ def test_tolerances_by_pattern() -> None:
         ({"standing": {"*": 0.0}}, "Tolerances.standing.*: a tolerance is a number above 0, found 0.0"),
         ({"standing": 0.1, "walking": {"*_hip": 0.2}}, "walking: no pattern fits left_knee, which standing has"),
     ):
-        assert said in refusal(tolerances.Tolerances(**wrong).build, context)
+        assert said in refusal(Tolerances(**wrong).build, context)
 
 
 def test_what_counts_from_the_start_counts_from_the_patch_on_a_terrain(rig: Rig) -> None:
@@ -301,14 +303,14 @@ def test_what_counts_from_the_start_counts_from_the_patch_on_a_terrain(rig: Rig)
     start = np.array(rig.robot.start)[:3]
     here = rig.worlds.joint_q.numpy()[:, ROOT : ROOT + 3]
     way = here - start - origins
-    near(rig.call(ground.root_displacement_on_terrain), way)
+    near(rig.call("root_displacement_on_terrain"), way)
     far = np.hypot(way[:, 0], way[:, 1])
     limit = np.sort(far)[:2].mean()
-    near(rig.call(ground.root_too_far_on_terrain, distance=limit), far > limit)
-    rig.call(ground.planar_pose_command_on_terrain, command=3, stream=2, x=(-1.0, 1.0), y=(1.0, 2.0), heading=(0.0, 3.0))  # fmt: skip
+    near(rig.call("root_too_far_on_terrain", distance=limit), far > limit)
+    rig.call("planar_pose_command_on_terrain", command=3, stream=2, x=(-1.0, 1.0), y=(1.0, 2.0), heading=(0.0, 3.0))  # fmt: skip
     target = rig.episodes.memory.numpy()[:, 6:8] - start[:2] - origins[:, :2]
     assert (np.abs(target[:, 0]) <= 1.0 + 1e-5).all() and (target[:, 1] >= 1.0 - 1e-5).all() and (target[:, 1] <= 2.0 + 1e-5).all()  # fmt: skip
-    rig.call(ground.reset_to_default_on_terrain)
+    rig.call("reset_to_default_on_terrain")
     placed = rig.worlds.joint_q.numpy()
     near(placed[:, ROOT : ROOT + 3], start + origins)
     near(placed[:, rig.robot.coordinates.numpy()], np.tile(rig.robot.defaults.numpy(), (len(placed), 1)))

@@ -31,12 +31,9 @@ from tests.support.worker.terms_rig import (
     terms_of,
 )
 from worker.simulation.sensors.frames import FrameArrays
-from worker.tasks.terms import following, manipulation, tracking
-from worker.tasks.terms.frame_sampling import AdaptiveSampling, FrameSampling
-from worker.tasks.terms.motion import Motion, MotionArrays
+from worker.tasks.terms.more.frame_sampling import AdaptiveSampling, FrameSampling
+from worker.tasks.terms.more.motion import Motion, MotionArrays
 
-SHARED = ["near", "commanded_point", "frame_of", "anchor_pose", "wanted_anchor", "relative_reference", "sampled"]
-SHARED += ["anchor_way", "body_way", "body_turn_error"]
 COMMAND, FRAMES, FOLLOWED, ANCHOR = 10, 8, [1, 4, 5], 2
 near = partial(close, rtol=5e-4, atol=5e-5)
 
@@ -69,7 +66,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     hand = FrameArrays()
     hand.positions = array(random.normal(size=(WORLDS, 2, 3)), wp.vec3)
     hand.rotations = array(rotations(random, WORLDS, 2), wp.quat)
-    functions = terms_of(manipulation, tracking, following, without=SHARED)
+    functions = terms_of("manipulation", "tracking", "following")
     made = Rig(functions, tmp_path_factory.mktemp("tracking"), {FrameArrays: hand, MotionArrays: motion()})
     values = made.episodes.memory.numpy()
     values[:, COMMAND + 3 : COMMAND + 7] = rotations(random, WORLDS)
@@ -96,41 +93,41 @@ def test_terms_of_manipulation(rig: Rig) -> None:
     def inside(way: np.ndarray, turn: np.ndarray = base) -> np.ndarray:
         return np.einsum("wji,wj->wi", turn, way)
 
-    call, m, c = rig.call, manipulation, {"command": COMMAND}
-    near(call(m.object_position_in_root), inside(thing - here))
-    near(matrix(call(m.object_orientation_in_root)), np.swapaxes(base, 1, 2) @ thing_turn)
-    near(call(m.object_velocity_in_root), inside(rig.qd[:, OBJECT_DOF : OBJECT_DOF + 3]))
-    near(call(m.hand_to_object), inside(thing - hand))
-    near(call(m.object_to_target, **c), inside(target - thing))
-    near(call(m.target_in_hand, **c), inside(target - hand, hand_turn))
-    near(call(m.target_in_root, **c), inside(target - here))
+    call, c = rig.call, {"command": COMMAND}
+    near(call("object_position_in_root"), inside(thing - here))
+    near(matrix(call("object_orientation_in_root")), np.swapaxes(base, 1, 2) @ thing_turn)
+    near(call("object_velocity_in_root"), inside(rig.qd[:, OBJECT_DOF : OBJECT_DOF + 3]))
+    near(call("hand_to_object"), inside(thing - hand))
+    near(call("object_to_target", **c), inside(target - thing))
+    near(call("target_in_hand", **c), inside(target - hand, hand_turn))
+    near(call("target_in_root", **c), inside(target - here))
     reach, bring = np.linalg.norm(thing - hand, axis=1), np.linalg.norm(target - thing, axis=1)
-    near(call(m.hand_object_distance, robot=rig.other), reach)
-    near(call(m.object_target_distance, robot=rig.other, **c), bring)
-    near(call(m.reach_object, robot=rig.other, std=2.0), np.exp(-((reach / 2) ** 2)))
-    near(call(m.near_object, robot=rig.other, std=2.0), 1 - np.tanh(reach / 2))
-    near(call(m.bring_object, robot=rig.other, std=2.0, **c), np.exp(-((bring / 2) ** 2)))
+    near(call("hand_object_distance", robot=rig.other), reach)
+    near(call("object_target_distance", robot=rig.other, **c), bring)
+    near(call("reach_object", robot=rig.other, std=2.0), np.exp(-((reach / 2) ** 2)))
+    near(call("near_object", robot=rig.other, std=2.0), 1 - np.tanh(reach / 2))
+    near(call("bring_object", robot=rig.other, std=2.0, **c), np.exp(-((bring / 2) ** 2)))
     staged = np.exp(-((reach / 2) ** 2)) * (1 + np.exp(-((bring / 3) ** 2)))
-    near(call(m.reach_and_bring_object, robot=rig.other, reaching_std=2.0, bringing_std=3.0, **c), staged)
+    near(call("reach_and_bring_object", robot=rig.other, reaching_std=2.0, bringing_std=3.0, **c), staged)
     high = thing[:, 2] > np.median(thing[:, 2])
     height = float(np.median(thing[:, 2])) + 1e-4
-    near(call(m.object_lifted, robot=rig.other, height=height), high)
+    near(call("object_lifted", robot=rig.other, height=height), high)
     far = np.linalg.norm(place - thing, axis=1)
-    near(call(m.lifted_object_near_command, std=2.0, height=height, **c), high * (1 - np.tanh(far / 2)))
+    near(call("lifted_object_near_command", std=2.0, height=height, **c), high * (1 - np.tanh(far / 2)))
     limit = float(np.median(bring)) + 1e-4
-    near(call(m.object_at_target, robot=rig.other, distance=limit, **c), bring < limit)
-    near(call(m.object_reached_command, distance=float(np.median(far)) + 1e-4, **c), far <= np.median(far))
+    near(call("object_at_target", robot=rig.other, distance=limit, **c), bring < limit)
+    near(call("object_reached_command", distance=float(np.median(far)) + 1e-4, **c), far <= np.median(far))
     reached = np.linalg.norm(place - hand, axis=1)
-    near(call(m.hand_command_distance, **c), reached)
-    near(call(m.hand_near_command, std=2.0, **c), 1 - np.tanh(reached / 2))
-    near(call(m.hand_command_turn, **c), angle(wanted_turn, hand_turn))
-    near(call(m.object_command_turn, **c), angle(wanted_turn, thing_turn))
+    near(call("hand_command_distance", **c), reached)
+    near(call("hand_near_command", std=2.0, **c), 1 - np.tanh(reached / 2))
+    near(call("hand_command_turn", **c), angle(wanted_turn, hand_turn))
+    near(call("object_command_turn", **c), angle(wanted_turn, thing_turn))
 
     numbers = rig.episodes.memory.numpy()
     numbers[:, 20] = [0.0, 1.0, 0.0]  # the second was there before
     rig.episodes.memory.assign(numbers)
     for _ in range(2):
-        found = call(m.object_was_at_target, robot=rig.other, memory=20, distance=limit, **c)
+        found = call("object_was_at_target", robot=rig.other, memory=20, distance=limit, **c)
         near(found, (bring < limit) | np.array([False, True, False]))
 
 
@@ -145,20 +142,20 @@ def test_terms_of_following_a_motion(rig: Rig) -> None:
     anchor, anchor_turn = here[:, ANCHOR], turn[:, ANCHOR]
     back = np.swapaxes(anchor_turn, 1, 2)
 
-    near(rig.call(tracking.motion_over, command=0), [0, 0, 1])
+    near(rig.call("motion_over", command=0), [0, 0, 1])
     for joint in range(JOINTS):
-        near(rig.call(tracking.wanted_joint_position, joint, command=0), m.joint_positions.numpy()[frame, joint])
-        near(rig.call(tracking.wanted_joint_velocity, joint, command=0), m.joint_velocities.numpy()[frame, joint])
+        near(rig.call("wanted_joint_position", joint, command=0), m.joint_positions.numpy()[frame, joint])
+        near(rig.call("wanted_joint_velocity", joint, command=0), m.joint_velocities.numpy()[frame, joint])
     way = wanted[:, ANCHOR] - anchor
-    near(rig.call(tracking.wanted_anchor_position, command=0), np.einsum("wij,wj->wi", back, way))
+    near(rig.call("wanted_anchor_position", command=0), np.einsum("wij,wj->wi", back, way))
     for index in range(6):
         elements = (back @ wanted_turn[:, ANCHOR])[:, :, :2].reshape(WORLDS, 6)
-        near(rig.call(tracking.wanted_anchor_turn, index, command=0), elements[:, index])
+        near(rig.call("wanted_anchor_turn", index, command=0), elements[:, index])
     for body in range(3):
-        near(rig.call(tracking.followed_body_position, body), np.einsum("wij,wj->wi", back, here[:, body] - anchor))
+        near(rig.call("followed_body_position", body), np.einsum("wij,wj->wi", back, here[:, body] - anchor))
         elements = (back @ turn[:, body])[:, :, :2].reshape(WORLDS, 6)
         for index in range(6):
-            near(rig.call(tracking.followed_body_turn, 6 * body + index), elements[:, index])
+            near(rig.call("followed_body_turn", 6 * body + index), elements[:, index])
 
     # relative references: carried to the robot's anchor along x and y and about the vertical
     between = anchor_turn @ np.swapaxes(wanted_turn[:, ANCHOR], 1, 2)
@@ -178,12 +175,12 @@ def test_terms_of_following_a_motion(rig: Rig) -> None:
         "follow_body_velocities": ((linear - m.linear.numpy()[frame]) ** 2).sum(-1).mean(1),
         "follow_body_turning": ((velocities[..., 3:] - m.angular.numpy()[frame]) ** 2).sum(-1).mean(1),
     }.items():
-        near(rig.call(getattr(following, name), command=0, std=2.0), np.exp(-squares / 4), name)
-    near(rig.call(following.anchor_distance, command=0), np.linalg.norm(way, axis=1))
-    near(rig.call(following.anchor_turn_error, command=0), anchor_angle)
-    near(rig.call(following.mean_body_distance, command=0), np.linalg.norm(wanted - here, axis=-1).mean(1))
-    near(rig.call(following.mean_relative_body_distance, command=0), distance.mean(1))
-    near(rig.call(following.mean_relative_body_turn, command=0), turned.mean(1))
+        near(rig.call(name, command=0, std=2.0), np.exp(-squares / 4), name)
+    near(rig.call("anchor_distance", command=0), np.linalg.norm(way, axis=1))
+    near(rig.call("anchor_turn_error", command=0), anchor_angle)
+    near(rig.call("mean_body_distance", command=0), np.linalg.norm(wanted - here, axis=-1).mean(1))
+    near(rig.call("mean_relative_body_distance", command=0), distance.mean(1))
+    near(rig.call("mean_relative_body_turn", command=0), turned.mean(1))
     tilt = np.abs(wanted_turn[:, ANCHOR, 2, 2] - anchor_turn[:, 2, 2])
     for name, values in (
         ("anchor_too_far", np.linalg.norm(way, axis=1)),
@@ -191,22 +188,22 @@ def test_terms_of_following_a_motion(rig: Rig) -> None:
         ("anchor_tilt_off", tilt),
     ):
         limit = float(np.sort(values)[1:].mean())
-        near(rig.call(getattr(following, name), command=0, limit=limit), values > limit, name)
+        near(rig.call(name, command=0, limit=limit), values > limit, name)
     for body in range(3):
         for name, values in (("followed_body_too_far", distance), ("followed_body_height_off", np.abs(error[..., 2]))):
             limit = float(np.median(values)) + 1e-3
-            near(rig.call(getattr(following, name), body, command=0, limit=limit), values[:, body] > limit, name)
+            near(rig.call(name, body, command=0, limit=limit), values[:, body] > limit, name)
     q, qd = rig.q[:, rig.robot.coordinates.numpy()], rig.qd[:, rig.robot.dofs.numpy()]
     lag = np.linalg.norm(q - m.joint_positions.numpy()[frame], axis=1)
-    near(rig.call(following.joint_position_error_norm, command=0), lag)
+    near(rig.call("joint_position_error_norm", command=0), lag)
     speed = np.sqrt(((qd - m.joint_velocities.numpy()[frame]) ** 2).mean(1))
-    near(rig.call(following.joint_velocity_error, command=0), speed)
+    near(rig.call("joint_velocity_error", command=0), speed)
 
 
 def test_a_robot_begins_in_a_frame_of_the_motion_and_goes_on(rig: Rig) -> None:
     m, seen = rig.structs[MotionArrays], set()
     for seed in range(30):
-        rig.call(tracking.motion_command, command=0, stream=seed)
+        rig.call("motion_command", command=0, stream=seed)
         frames = rig.episodes.memory.numpy()[:, 0].astype(int)
         seen |= set(frames.tolist())
         q, qd = rig.worlds.joint_q.numpy(), rig.worlds.joint_qd.numpy()
@@ -220,13 +217,13 @@ def test_a_robot_begins_in_a_frame_of_the_motion_and_goes_on(rig: Rig) -> None:
         near(angular, m.root_angular.numpy()[frames])
         near(qd[:, ROOT_DOF : ROOT_DOF + 3] - np.cross(angular, arm), m.root_linear.numpy()[frames])
     assert seen == set(range(FRAMES))
-    rig.call(tracking.motion_command, command=0, stream=1, from_start=True, position=(0.0, 0.0, 0.5), joints=0.05)
+    rig.call("motion_command", command=0, stream=1, from_start=True, position=(0.0, 0.0, 0.5), joints=0.05)
     assert not rig.episodes.memory.numpy()[:, 0].any()
     moved = rig.worlds.joint_q.numpy()[:, ROOT : ROOT + 3] - m.roots.numpy()[0, :3]
     near(moved[:, :2], np.zeros((WORLDS, 2)))
     assert (np.abs(moved[:, 2]) <= 0.5).all() and np.ptp(moved[:, 2]) > 0.01
     for _ in range(3):
-        rig.call(tracking.advance_motion, command=0)
+        rig.call("advance_motion", command=0)
     near(rig.episodes.memory.numpy()[:, 0], [4.5] * WORLDS)
 
 

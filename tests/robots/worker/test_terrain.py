@@ -123,18 +123,6 @@ def test_random_heights_are_multiples_of_a_step_within_their_bounds() -> None:
     )
 
 
-def test_a_grid_is_level_on_each_square() -> None:
-    field = heights(Grid(width=0.4, border=0.4, platform=0.0), 1.0)
-    assert len(np.unique(field[5:7, 5:7])) == 1
-    assert len(np.unique(field[4:40:4, 4:40:4])) > 50, "and each is at a height of its own"
-
-
-def test_stones_shrink_but_stay_where_they_are() -> None:
-    easy, hard = (heights(Stones(side_variation=0, displacement=0, height_variation=0), d) == 0 for d in (0.0, 1.0))
-    assert hard.sum() < easy.sum()
-    assert not (hard & ~easy).any()
-
-
 def test_patches_lie_side_by_side_and_meet_at_height_zero() -> None:
     terrain = Terrain(
         kinds={Stairs(): 1.0, Rough(border=0.0): 1.0}, levels=3, size=(8.0, 8.0), resolution=0.1, border=0.0

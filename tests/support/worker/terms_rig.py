@@ -6,7 +6,7 @@ import contextlib
 import importlib.util
 import inspect
 import typing
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Self
@@ -17,6 +17,8 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
+from worker.tasks import terms as library
+from worker.tasks.terms.aliases import all_terms
 
 WORLDS, JOINTS, BODIES, ACTIONS, MEMORY = 3, 5, 7, 4, 40
 ROOT, ROOT_DOF = 2, 2  # two sliders of something else come first
@@ -35,10 +37,9 @@ READS = {
 }
 
 
-def terms_of(*modules: Any, without: Sequence[str] = ()) -> list[Any]:
-    """The terms that the modules define, but for those that only other terms call."""
-    found = [(module, each) for module in modules for each in vars(module).values() if isinstance(each, wp.Function)]
-    return [each for module, each in found if each.func.__module__ == module.__name__ and each.key not in without]
+def terms_of(*groups: str) -> list[str]:
+    """Names of the terms of these groups."""
+    return [name for group, name, _ in all_terms() if group in groups]
 
 
 def close(found: np.ndarray, wanted: Any, name: str = "", *, rtol: float = 1e-4, atol: float = 2e-5) -> None:
@@ -97,13 +98,13 @@ class Rig:
     """Random worlds with a robot, an object and bodies; ``call`` evaluates a term in all of them.
 
     Args:
-        terms: Functions, all compiled at once.
+        terms: Names, all compiled at once.
         folder: Where the module of kernels is written.
         structs: Further structs by type, such as those of sensors; random numbers are up to the caller.
         seed: Of the random numbers.
     """
 
-    def __init__(self, terms: list[Any], folder: Path, structs: dict[Any, Any] | None = None, seed: int = 1) -> None:
+    def __init__(self, terms: list[str], folder: Path, structs: dict[Any, Any] | None = None, seed: int = 1) -> None:
         random = self.random = np.random.default_rng(seed)
         worlds, episodes, bodies = WorldArrays(), EpisodeArrays(), BodyArrays()
         self.q = random.normal(size=(WORLDS, OBJECT + 7)).astype(np.float32)
@@ -157,34 +158,36 @@ class Rig:
         own = {f"own_{name}": np.einsum("wji,wj->wi", turn, each) for name, each in seen.items()}
         return SimpleNamespace(turn=turn, yaw=yaw, **seen, **own)
 
-    def call(self, term: Any, element: int = 0, *, robot: RobotArrays | None = None, **numbers: Any) -> np.ndarray:
+    def call(self, name: str, element: int = 0, *, robot: RobotArrays | None = None, **numbers: Any) -> np.ndarray:
         """What a term gives in each world, shape ``(worlds,)`` or ``(worlds, numbers)``; a bool is 0 or 1.
 
         Args:
-            term: One of those that the rig was made with.
+            name: One of the terms that the rig was made with.
             element: Its joint, body, index or action.
             robot: Instead of the rig's own.
             **numbers: Its numbers; those with a default can be left out. ``command`` and ``memory`` are columns, ``stream`` a seed.
         """
-        parameters = self._signatures[term.key]
+        term = getattr(library, name)
+        parameters = self._signatures[name]
         defaults = {key: value.default for key, value in inspect.signature(term.func).parameters.items()}
         flat: list[float] = []
-        for name, kind in parameters.items():
-            if kind in WIDTHS and name not in ("world", *ELEMENTS):
-                value = numbers.pop(name) if name in numbers else {"seconds": SECONDS}.get(name, defaults[name])
-                assert value is not inspect.Parameter.empty, f"{term.key} needs {name}"
+        for key, kind in parameters.items():
+            if kind in WIDTHS and key not in ("world", *ELEMENTS):
+                value = numbers.pop(key) if key in numbers else {"seconds": SECONDS}.get(key, defaults[key])
+                assert value is not inspect.Parameter.empty, f"{name} needs {key}"
                 flat += [float(each) for each in (np.atleast_1d(value) if not hasattr(value, "__len__") else value)]
         seed = numbers.pop("stream", 0)
-        assert not numbers, f"{term.key} has no {', '.join(numbers)}"
+        assert not numbers, f"{name} has no {', '.join(numbers)}"
         out = wp.zeros((WORLDS, 7), dtype=wp.float32, device="cpu")
         inputs = [*self.structs.values(), robot or self.robot, self.other, element, seed, array(flat or [0.0]), out]
-        wp.launch(getattr(self._kernels, f"call_{term.key}"), dim=WORLDS, inputs=inputs, device="cpu")
+        wp.launch(getattr(self._kernels, f"call_{name}"), dim=WORLDS, inputs=inputs, device="cpu")
         returns = typing.get_type_hints(term.func).get("return", type(None))
         width = WIDTHS.get(returns, 0)
         found: np.ndarray = out.numpy().astype(np.float64)
         return found[:, 0] if width == 1 else found[:, :width]
 
-    def _compile(self, terms: list[Any], folder: Path) -> Any:
+    def _compile(self, names_of_terms: list[str], folder: Path) -> Any:
+        terms = [getattr(library, name) for name in names_of_terms]
         kinds = list(self.structs)
         names = {kind: f"struct_{number}" for number, kind in enumerate(kinds)}
         modules = sorted({kind.cls.__module__ for kind in [*kinds, RobotArrays]})

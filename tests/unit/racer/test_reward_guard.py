@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from docs.tools.reward_table import table
 from racer.rewards import guard
 from racer.rewards.__main__ import main
 from racer.rewards.guard import check, check_source
-from racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of, table
+from racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of
 from racer.rewards.problems import KINDS
 from racer.rewards.samples import CentreLine, oval, samples
 from racer.rewards.translation import translate

@@ -1,24 +1,31 @@
-"""The pages of all terms are those that their docstrings give, and every term is reached by its name."""
+"""The pages of all terms are those that their docstrings give, and every term is reached by its name, here and in other libraries."""
 
 from __future__ import annotations
 
 import ast
 import inspect
 import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import warp as wp
 
+from docs.tools.terms_pages import porting, reference
 from tests.conftest import REPOSITORY
 from worker.simulation.declared_randomization import QUANTITIES
 from worker.tasks import terms
-from worker.tasks.terms.__main__ import main
-from worker.tasks.terms.catalogue import ELSEWHERE, entries, porting, reference, split
+from worker.tasks.declare.term_needs import needs_of
+from worker.tasks.terms.aliases import ELSEWHERE, LIBRARIES, aliases, all_terms, meaning_and_names
 
 HELPERS = ("resolve_env_ids",)
 """Functions of mjlab's modules that are no terms."""
+NAMES = (REPOSITORY / "tests" / "data" / "former" / "terms.txt").read_text().split()
+"""All terms that were ever documented."""
 
 
 def mjlab() -> Path:
@@ -29,24 +36,79 @@ def mjlab() -> Path:
 
 
 @pytest.mark.parametrize(("page", "written"), [("terms", reference), ("porting", porting)])
-def test_a_page_is_up_to_date(page: str, written: object) -> None:
-    assert callable(written)
+def test_a_page_is_up_to_date(page: str, written: Callable[[], str]) -> None:
     assert (REPOSITORY / "docs" / "tasks" / f"{page}.md").read_text() == written()
 
 
-def test_every_term_is_in_the_catalogue_is_reached_by_its_name_and_says_what_it_is() -> None:
-    found = list(entries())
-    assert len(found) > 200
-    names = {entry.name for entry in found}
-    assert len(names) == len(found) and names == {
-        name for name, each in vars(terms).items() if isinstance(each, wp.Function)
-    }
-    for entry in found:
-        function = getattr(terms, entry.name)
-        assert isinstance(function, wp.Function) and function.func.__module__ == f"worker.tasks.terms.{entry.group}"
-        assert entry.meaning.endswith("."), entry.name
-        assert "world" in inspect.signature(function.func).parameters
-        assert (entry.returns == "") == (inspect.signature(function.func).return_annotation is inspect.Signature.empty)
+def test_every_term_is_reached_by_its_name_and_says_what_it_is() -> None:
+    found = {name: function for _, name, function in all_terms()}
+    assert {*NAMES} <= {*found} and len(found) == sum(1 for _ in all_terms())
+    assert {name for name in dir(terms) if isinstance(getattr(terms, name), wp.Function)} == {*found}
+    for name, function in found.items():
+        assert getattr(terms, name) is function and function.key == name
+        assert function.func is not None and "world" in inspect.signature(function.func).parameters
+        assert meaning_and_names(function)[0].endswith("."), name
+
+
+def test_terms_that_no_shipped_task_uses_are_imported_when_one_is_used_and_an_unknown_name_has_the_nearest() -> None:
+    code = (
+        "import sys; from worker.tasks import find_task, terms; find_task('G1Rough')\n"
+        "loaded = [name for name in sys.modules if name.startswith('worker.tasks.terms.more')]\n"
+        "from worker.tasks.terms import joint_power\n"
+        "from worker.tasks.terms.tracking import motion_command\n"
+        "print(loaded, joint_power.key, motion_command is terms.motion_command)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines()[-1] == "[] joint_power True"
+    with pytest.raises(AttributeError, match=r"there is no term 'joint_powr'; did you mean joint_power\?"):
+        _ = terms.joint_powr
+
+
+def test_a_composed_term_is_a_function_of_its_parts_whose_source_says_no_more_so_that_its_kernels_are_cached() -> None:
+    upright, reset, posture = (getattr(terms, name).func for name in ("upright", "reset_root_on_terrain", "posture"))
+    assert inspect.getsource(upright) == (
+        "def upright(world: int, worlds: WorldArrays, robot: RobotArrays, std: float) -> float:\n"
+        "    return of_likeness(of_tilt_squared(world, worlds, robot), std)\n"
+    )
+    assert list(inspect.signature(reset).parameters)[:7] == [
+        "world",
+        "worlds",
+        "robot",
+        "bodies",
+        "terrain",
+        "stream",
+        "x",
+    ]
+    assert reset.__defaults__ == (wp.vec2(0.0, 0.0),) * 12 and needs_of(terms.reset_root_on_terrain).free_root
+    assert "for joint in range(robot.defaults.shape[0]):" in inspect.getsource(posture)
+
+
+@pytest.mark.parametrize("library", LIBRARIES)
+def test_a_name_of_another_library_is_our_term_that_names_it_without_a_remark_or_says_what_to_use_instead(
+    library: str,
+) -> None:
+    module, known = getattr(terms, library), aliases(library)
+    assert len(known) > 80 and dir(module) == sorted(known)
+    named = [(name, each) for _, name, each in all_terms()]
+    exact = Counter()
+    for name, function in named:
+        for theirs, remark in meaning_and_names(function)[1][library]:
+            if theirs.isidentifier():
+                assert library in ("mjlab", "isaaclab") and isinstance(getattr(module, theirs), wp.Function)
+                if not remark:
+                    exact[theirs] += 1
+                    assert getattr(module, theirs) is getattr(terms, name)
+    assert exact.most_common(1)[0][1] == 1
+    assert module.joint_vel_l2 is terms.joint_velocity_squared
+    with pytest.raises(
+        AttributeError, match=rf"no term has the name 'joint_vel_l3' in {LIBRARIES[library]}; .*joint_vel_l2"
+    ):
+        _ = module.joint_vel_l3
+    instead = {"mjlab": ("camera_rgb", "`Image` of a"), "isaaclab": ("modify_env_param", "curriculum")}[library]
+    with pytest.raises(
+        AttributeError, match=rf"{instead[0]} is no term here \(docs/tasks/porting.md\): .*{instead[1]}"
+    ):
+        getattr(module, instead[0])
 
 
 def test_the_page_of_names_has_all_terms_of_mjlabs_tasks() -> None:
@@ -66,12 +128,9 @@ def test_the_page_of_names_has_all_terms_of_mjlabs_tasks() -> None:
 
 
 def test_no_name_is_both_a_term_here_and_elsewhere() -> None:
-    ported = {
-        theirs.partition(" ")[0] for entry in entries() for theirs in (*split(entry.mjlab), *split(entry.isaac_lab))
-    }
-    elsewhere = [row.partition("|")[0] for row in re.findall(r"^\| (`.*)$", ELSEWHERE, re.MULTILINE)]
+    elsewhere = {name for row in ELSEWHERE.splitlines() for name in re.findall(r"`(\w+)`", row.partition(" | ")[0])}
     assert len(elsewhere) > 10
-    assert {name for row in elsewhere for name in re.findall(r"`(\w+)`", row)} & ported == set()
+    assert elsewhere & {*aliases("mjlab"), *aliases("isaaclab")} == set()
 
 
 def test_the_page_on_randomisation_has_all_quantities_of_mjlab_and_names_only_ours() -> None:
@@ -79,13 +138,8 @@ def test_the_page_on_randomisation_has_all_quantities_of_mjlab_and_names_only_ou
     theirs, ours = page.partition("| Isaac Lab's |")[0], re.findall(r'`Randomize\("(\w+)"', page)
     tree = ast.parse((mjlab() / "envs" / "mdp" / "dr" / "__init__.py").read_text())
     imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module != "_types"]
-    wanted = {alias.name for node in imports for alias in node.names}
-    assert len(wanted) > 40
-    told = {name for row in re.findall(r"^\| (`[^|]*)", theirs, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
-    assert told == wanted
+    expected = {alias.name for node in imports for alias in node.names}
+    assert len(expected) > 40
+    listed = {name for row in re.findall(r"^\| (`[^|]*)", theirs, re.MULTILINE) for name in re.findall(r"`(\w+)`", row)}
+    assert listed == expected
     assert ours and set(ours) <= set(QUANTITIES)
-
-
-def test_an_unknown_page_is_refused_in_one_line() -> None:
-    with pytest.raises(SystemExit, match=r"there is no page 'portnig'; there are reference, porting"):
-        main(["portnig"])

@@ -393,7 +393,7 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
 
 def _function_instead(given: Any) -> str:
     """What a term takes instead of a value that is no function; for the name of a function, that function."""
-    known = [f"terms.{name}" for name, value in vars(terms).items() if is_warp(value)]
+    known = [f"terms.{name}" for name in dir(terms) if is_warp(getattr(terms, name))]
     meant = f"terms.{given.removeprefix('terms.')}" if isinstance(given, str) else ""
     anything = "a term is a @wp.func, or a Python function of the task that gives a tensor"
     return nearest(meant, known, anything, cutoff=0.8)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from shared_store.contract.policy import Frame
 from worker.simulation.sensors.imu import Imu
 from worker.tasks import terms
-from worker.tasks.terms import root
+from worker.tasks.declare.functions import is_warp
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView
@@ -21,7 +21,7 @@ _HERE, _NOT_TURNED = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)
 
 def is_library(term: Term) -> bool:
     """Whether a term's function is from Muster's library, rather than the task's own with the same name."""
-    return getattr(terms, term.function_name, None) is term.function
+    return is_warp(term.function) and term.function.func.__module__.startswith(f"{terms.__name__}.")
 
 
 def frame_of(plan: KernelPlan, term: Term, sensors: Sequence[str]) -> Frame | None:
@@ -37,7 +37,7 @@ def frame_of(plan: KernelPlan, term: Term, sensors: Sequence[str]) -> Frame | No
     units = [plan.declaration.sensors[name] for name in sensors]
     if len(units) == 1 and isinstance(units[0], Imu):
         return _of_unit(plan.views[units[0].robot], units[0])
-    if getattr(root, term.function_name, None) is not term.function:
+    if term.function.func.__module__.rpartition(".")[2] != "root":
         return None
     view = plan.views[term.robot]
     position = view.root_com if term.function in _AT_CENTRE_OF_MASS else _HERE

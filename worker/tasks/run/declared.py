@@ -35,7 +35,6 @@ from worker.tasks.run.step_needs import StepNeeds
 from worker.tasks.run.task import Task
 from worker.tasks.run.task_checks import checked_interface
 from worker.tasks.run.torch_terms import TorchTerms
-from worker.tasks.terms.motion import RecordedMotion
 
 
 class DeclaredTask(Task):
@@ -185,8 +184,8 @@ class DeclaredTask(Task):
             name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
         }
         self._cameras = [sensor for sensor in self.sensors.values() if isinstance(sensor, Camera)]
-        motions = {name: sensor for name, sensor in self.sensors.items() if isinstance(sensor, RecordedMotion)}
-        self._samplings = {name: each.sampling for name, each in motions.items() if each.sampling.is_adaptive}
+        samplings = {name: getattr(sensor, "sampling", None) for name, sensor in self.sensors.items()}  # of motions
+        self._samplings = {name: each for name, each in samplings.items() if each is not None and each.is_adaptive}
         self._movers = [sensor for sensor in self.sensors.values() if isinstance(sensor, IkSolver)]
         self._sees = any(isinstance(sensor, Camera | RayCasting) for sensor in self.sensors.values())
         structs: dict[str, Any] = {

@@ -1,329 +1,87 @@
-# ruff: noqa: F401
+# ruff: noqa: F403
 """Named terms for declared tasks: small Warp functions for actions, observations, rewards, terminations, commands and events.
 
-A task uses them as ``terms.NAME``. ``docs/tasks/terms.md`` lists them all, and ``docs/tasks/porting.md`` maps mjlab's and Isaac Lab's
-terms to them; ``python -m worker.tasks.terms`` writes both from the docstrings.
+A task uses them as ``terms.NAME``. Those that no shipped task needs are in :mod:`worker.tasks.terms.more`, which is imported when one
+of them is used. ``terms.mjlab.NAME`` and ``terms.isaaclab.NAME`` find a term by its name there. ``docs/tasks/terms.md`` lists all terms.
 """
 
-from worker.tasks.terms.actions import (
-    action_acceleration,
-    action_acceleration_squared,
-    action_excess,
-    action_magnitude,
-    action_rate_squared,
-    action_squared,
-    clipped_last_action,
-    effort,
-    last_action,
-    limited_effort,
-    limited_position_target,
-    mean_action_acceleration,
-    move_frame,
-    position_target,
-    relative_position_target,
-    share_of_range_target,
-    smoothed_position_target,
-    two_positions_target,
-    two_velocities_target,
-    velocity_target,
+from __future__ import annotations
+
+from importlib import import_module
+from types import ModuleType
+from typing import TYPE_CHECKING, Any
+
+import warp as wp
+
+from shared_store.contract.error_text import nearest
+from worker.tasks.terms.tolerances import ToleranceArrays as ToleranceArrays
+from worker.tasks.terms.tolerances import Tolerances as Tolerances
+
+if TYPE_CHECKING:  # what an editor completes
+    from worker.tasks.terms.actions import *
+    from worker.tasks.terms.bodies import *
+    from worker.tasks.terms.commands import *
+    from worker.tasks.terms.contacts import *
+    from worker.tasks.terms.episode import *
+    from worker.tasks.terms.events import *
+    from worker.tasks.terms.footing import *
+    from worker.tasks.terms.ground import *
+    from worker.tasks.terms.joints import *
+    from worker.tasks.terms.locomotion import *
+    from worker.tasks.terms.manipulation import *
+    from worker.tasks.terms.more import *
+    from worker.tasks.terms.more.actions import *
+    from worker.tasks.terms.more.bodies import *
+    from worker.tasks.terms.more.commands import *
+    from worker.tasks.terms.more.contacts import *
+    from worker.tasks.terms.more.episode import *
+    from worker.tasks.terms.more.events import *
+    from worker.tasks.terms.more.following import *
+    from worker.tasks.terms.more.ground import *
+    from worker.tasks.terms.more.joints import *
+    from worker.tasks.terms.more.locomotion import *
+    from worker.tasks.terms.more.manipulation import *
+    from worker.tasks.terms.more.root import *
+    from worker.tasks.terms.more.sensing import *
+    from worker.tasks.terms.more.tracking import *
+    from worker.tasks.terms.root import *
+    from worker.tasks.terms.selecting import *
+    from worker.tasks.terms.sensing import *
+
+GROUPS = (
+    *("joints", "root", "bodies", "actions", "commands", "events", "episode", "locomotion", "tolerances"),
+    *("contacts", "sensing", "ground", "footing", "manipulation", "selecting"),
 )
-from worker.tasks.terms.bodies import (
-    body_angular_velocity,
-    body_angular_velocity_in_own_frame,
-    body_com_linear_velocity,
-    body_com_position,
-    body_forward_in_root,
-    body_height,
-    body_height_error_squared,
-    body_left_in_root,
-    body_linear_velocity,
-    body_linear_velocity_in_own_frame,
-    body_orientation,
-    body_orientation_in_root,
-    body_position,
-    body_position_in_root,
-    body_projected_gravity,
-    body_speed,
-    body_speed_squared,
-    body_tilt_squared,
-    body_tilted,
-    body_tipping_rate_squared,
-    body_too_low,
-    body_turn_from_root,
-    body_upright,
-    body_velocity_in_root,
-)
-from worker.tasks.terms.commands import (
-    command_number,
-    command_rotation,
-    command_speed,
-    command_vector,
-    heading_velocity_command,
-    lift_command,
-    moving_velocity_command,
-    number_command,
-    planar_pose_command,
-    pose_command,
-    position_command,
-    steer_planar_pose_command,
-    steer_velocity_command,
-    velocity_command,
-)
-from worker.tasks.terms.contacts import (
-    air_time,
-    column_hard_contact_steps,
-    commanded_time_in_air,
-    contact_count,
-    contact_force,
-    contact_force_excess,
-    contact_force_logarithm,
-    contact_strength,
-    contact_time,
-    foot_clearance,
-    foot_slide,
-    foot_slip,
-    foot_stumble,
-    hard_contact_steps,
-    illegal_contact,
-    in_contact,
-    liftoff,
-    no_contact,
-    single_stance_time,
-    soft_landing,
-    step_time,
-    swing_height_error,
-    time_in_air,
-    touchdown,
-    undesired_contact,
-)
-from worker.tasks.terms.episode import (
-    alive,
-    elapsed,
-    ended,
-    gait_clock,
-    level,
-    not_finite,
-    older_than,
-    time_left,
-)
-from worker.tasks.terms.events import (
-    apply_impulse,
-    apply_wrench,
-    push,
-    reset_joints_between_limits,
-    reset_joints_by_offset,
-    reset_joints_by_scale,
-    reset_joints_in_range,
-    reset_root,
-    reset_root_any_way_up,
-    reset_to_default,
-)
-from worker.tasks.terms.following import (
-    anchor_distance,
-    anchor_height_off,
-    anchor_tilt_off,
-    anchor_too_far,
-    anchor_turn_error,
-    follow_anchor_position,
-    follow_anchor_turn,
-    follow_body_positions,
-    follow_body_turning,
-    follow_body_turns,
-    follow_body_velocities,
-    followed_body_height_off,
-    followed_body_too_far,
-    joint_position_error_norm,
-    joint_velocity_error,
-    mean_body_distance,
-    mean_relative_body_distance,
-    mean_relative_body_turn,
-)
-from worker.tasks.terms.footing import (
-    body_upright_on_ground,
-    frame_clearance,
-    swung_foot_clearance,
-    swung_foot_height_error,
-)
-from worker.tasks.terms.frame_sampling import AdaptiveSampling
-from worker.tasks.terms.ground import (
-    draw_patch,
-    foot_clearance_above_ground,
-    frame_height_above_ground,
-    height_above_ground,
-    left_patch,
-    left_terrain,
-    planar_pose_command_on_terrain,
-    reset_root_on_terrain,
-    reset_to_default_on_terrain,
-    root_displacement_on_terrain,
-    root_too_far_on_terrain,
-    scanned_height,
-    scanned_height_error_squared,
-    scanned_height_mean,
-    swing_height_error_above_ground,
-    terrain_level,
-    too_low_above_ground,
-    upright_on_ground,
-    walk_to_levels,
-)
-from worker.tasks.terms.joints import (
-    joint_acceleration,
-    joint_acceleration_squared,
-    joint_beyond_limits,
-    joint_deviation,
-    joint_deviation_squared,
-    joint_effort,
-    joint_effort_at_limit,
-    joint_effort_excess,
-    joint_effort_magnitude,
-    joint_effort_share,
-    joint_effort_squared,
-    joint_limit_excess,
-    joint_offset,
-    joint_out_of_range,
-    joint_position,
-    joint_power,
-    joint_power_magnitude,
-    joint_share_of_range,
-    joint_speed,
-    joint_target_error_squared,
-    joint_too_fast,
-    joint_velocity,
-    joint_velocity_excess,
-    joint_velocity_excess_squared,
-    joint_velocity_squared,
-    joint_work,
-    measured_joint_offset,
-    measured_joint_position,
-)
-from worker.tasks.terms.locomotion import (
-    deviation_when_standing,
-    distance_left,
-    heading_error,
-    motion_when_standing,
-    near_place,
-    planar_velocity_error,
-    posture,
-    track_angular_velocity,
-    track_linear_velocity,
-    track_planar_velocity,
-    track_planar_velocity_by_heading,
-    track_turning_velocity,
-    track_turning_velocity_in_world,
-    turning_velocity_error,
-    velocity_along_command,
-)
-from worker.tasks.terms.manipulation import (
-    bring_object,
-    hand_command_distance,
-    hand_command_turn,
-    hand_near_command,
-    hand_object_distance,
-    hand_to_object,
-    lifted_object_near_command,
-    near_object,
-    object_at_target,
-    object_command_turn,
-    object_lifted,
-    object_orientation_in_root,
-    object_position_in_root,
-    object_reached_command,
-    object_target_distance,
-    object_to_target,
-    object_velocity_in_root,
-    object_was_at_target,
-    reach_and_bring_object,
-    reach_object,
-    target_in_hand,
-    target_in_root,
-)
-from worker.tasks.terms.motion import (
-    Motion,
-    MotionArrays,
-)
-from worker.tasks.terms.root import (
-    angle_to_point,
-    facing_point,
-    heading,
-    height_error_squared,
-    height_shortfall,
-    is_upright,
-    projected_gravity,
-    root_angles,
-    root_angular_velocity,
-    root_angular_velocity_in_world,
-    root_com_linear_velocity,
-    root_com_linear_velocity_in_world,
-    root_displacement,
-    root_height,
-    root_linear_velocity,
-    root_linear_velocity_in_world,
-    root_orientation,
-    root_orientation_element,
-    root_position,
-    root_tilted,
-    root_too_far,
-    root_too_fast,
-    root_too_high,
-    root_too_low,
-    root_uprightness,
-    root_velocity_in_heading_frame,
-    tilt_squared,
-    tipping_rate_squared,
-    upright,
-    velocity_towards,
-    vertical_com_velocity_squared,
-    vertical_velocity_squared,
-)
-from worker.tasks.terms.selecting import (
-    bring_chosen_object,
-    chosen_object_at_target,
-    chosen_object_height,
-    chosen_object_target_distance,
-    chosen_object_to_target,
-    chosen_object_was_at_target,
-    hand_to_chosen_object,
-    hand_to_each_object,
-    lift_one_command,
-    object_is_chosen,
-    reach_and_bring_chosen_object,
-)
-from worker.tasks.terms.sensing import (
-    angular_momentum,
-    angular_momentum_squared,
-    center_of_mass,
-    center_of_mass_velocity,
-    frame_angular_velocity,
-    frame_height,
-    frame_linear_velocity,
-    frame_orientation,
-    frame_orientation_element,
-    frame_position,
-    frame_velocity_in_own_frame,
-    imu_acceleration,
-    imu_acceleration_squared,
-    imu_angular_velocity,
-    imu_linear_velocity,
-    imu_orientation,
-    imu_projected_gravity,
-    nearest_obstacle,
-    ray_distance,
-)
-from worker.tasks.terms.tolerances import (
-    ToleranceArrays,
-    Tolerances,
-    commanded_posture,
-    tolerant_posture,
-)
-from worker.tasks.terms.tracking import (
-    advance_motion,
-    evenness_of_frames,
-    followed_body_position,
-    followed_body_turn,
-    motion_command,
-    motion_over,
-    wanted_anchor_position,
-    wanted_anchor_turn,
-    wanted_joint_position,
-    wanted_joint_velocity,
-)
+"""Modules of terms, in the order of the documentation."""
+
+
+def terms_of(module: ModuleType) -> dict[str, wp.Function]:
+    """The terms that a module defines, by name: its public Warp functions whose first parameter is ``world``."""
+    return {
+        name: each
+        for name, each in vars(module).items()
+        if isinstance(each, wp.Function)
+        and each.func is not None
+        and each.func.__module__ == module.__name__
+        and each.func.__code__.co_varnames[:1] == ("world",)
+        and not name.startswith("_")
+    }
+
+
+for _group in GROUPS:
+    globals().update(terms_of(import_module(f"{__name__}.{_group}")))
+
+
+def __getattr__(name: str) -> Any:
+    if name.startswith("__"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name in ("more", "mjlab", "isaaclab"):
+        return import_module(f"{__name__}.{name}")
+    further = vars(import_module(f"{__name__}.more"))
+    if name not in further:
+        raise AttributeError(f"there is no term {name!r}; {nearest(name, __dir__())}")
+    return further[name]
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *vars(import_module(f"{__name__}.more")), "mjlab", "isaaclab"})

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import warp as wp
 
-from worker.simulation.episodes import EpisodeArrays
-from worker.simulation.worlds import WorldArrays
-
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
 def alive(world: int, terminated: bool) -> float:
-    """1 in every step in which no termination ends the episode, else 0.
-
-    mjlab: is_alive. Isaac Lab: is_alive.
-    """
+    """1 in every step in which no termination ends the episode, else 0. mjlab, Isaac Lab: is_alive."""
     return wp.where(terminated, 0.0, 1.0)
 
 
@@ -23,67 +17,6 @@ def alive(world: int, terminated: bool) -> float:
 def ended(world: int, terminated: bool) -> float:
     """1 in a step in which a termination ends the episode, else 0; the clock is not a termination.
 
-    mjlab: is_terminated. Isaac Lab: is_terminated.
+    mjlab, Isaac Lab: is_terminated.
     """
     return wp.where(terminated, 1.0, 0.0)
-
-
-@wp.func
-def elapsed(world: int, episodes: EpisodeArrays, seconds: float) -> float:
-    """Time on the episode's clock [s].
-
-    mjlab: -. Isaac Lab: current_time_s.
-    """
-    return float(episodes.ages[world]) * seconds
-
-
-@wp.func
-def time_left(world: int, episodes: EpisodeArrays, seconds: float, limit: float) -> float:
-    """Remaining time of the episode, whose length is ``limit`` [s].
-
-    mjlab: -. Isaac Lab: remaining_time_s.
-    """
-    return limit - float(episodes.ages[world]) * seconds
-
-
-@wp.func
-def gait_clock(world: int, episodes: EpisodeArrays, seconds: float, period: float) -> wp.vec2:
-    """Sine and cosine of a phase with this ``period`` [s], 0 when the episode begins.
-
-    mjlab: -. Isaac Lab: -.
-    """
-    phase = 2.0 * wp.pi * float(episodes.ages[world]) * seconds / period
-    return wp.vec2(wp.sin(phase), wp.cos(phase))
-
-
-@wp.func
-def level(world: int, episodes: EpisodeArrays) -> float:
-    """Present difficulty of the task from its curriculum, from 0 to 1.
-
-    mjlab: -. Isaac Lab: -.
-    """
-    return episodes.level[0]
-
-
-@wp.func
-def not_finite(world: int, worlds: WorldArrays) -> bool:
-    """Whether a joint's position or velocity is NaN or infinite; a task resets such worlds by itself, and counts them.
-
-    mjlab: nan_detection. Isaac Lab: -.
-    """
-    for column in range(worlds.joint_q.shape[1]):
-        if not wp.isfinite(worlds.joint_q[world, column]):
-            return True
-    for column in range(worlds.joint_qd.shape[1]):  # noqa: SIM110 (Warp has no any())
-        if not wp.isfinite(worlds.joint_qd[world, column]):
-            return True
-    return False
-
-
-@wp.func
-def older_than(world: int, episodes: EpisodeArrays, seconds: float, limit: float) -> bool:
-    """Whether the episode has lasted ``limit`` [s], including the present step; the task's own clock needs no term.
-
-    mjlab: time_out. Isaac Lab: time_out.
-    """
-    return float(episodes.ages[world] + 1) * seconds >= limit - 0.5 * seconds

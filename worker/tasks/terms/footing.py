@@ -16,10 +16,11 @@ from worker.simulation.sensors.contact import ContactArrays
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.tasks.declare.term_needs import needs
-from worker.tasks.terms.commands import command_speed
-from worker.tasks.terms.contacts import planar_speed, swing_error
+from worker.tasks.terms.composing import likeness, planar_squared
+from worker.tasks.terms.feet import clearance_error, swing_error
 
 wp.set_module_options({"enable_backward": False})
+
 
 _PLANE = wp.constant(0.1)
 """Points are near a plane if their least variance is below this times the next."""
@@ -32,7 +33,7 @@ _LINE = wp.constant(1.0e-6)
 def frame_clearance(world: int, scan: HeightScanArrays, index: int, points: int) -> float:
     """Least height of frame ``index`` of a scan above the ground at its points, not below 0 [m], such as of a foot.
 
-    mjlab: foot_height. Isaac Lab: -.
+    mjlab: foot_height.
     """
     least = scan.heights[world, index * points]
     for point in range(1, points):
@@ -55,11 +56,10 @@ def swung_foot_clearance(
 ) -> float:
     """|h - height| times the planar speed of a foot [m^2/s], h its :func:`frame_clearance`, while the command asks for more than ``threshold``.
 
-    mjlab: feet_clearance. Isaac Lab: -.
+    mjlab: feet_clearance.
     """
-    if command_speed(world, episodes, command) <= threshold:
-        return 0.0
-    return wp.abs(frame_clearance(world, scan, index, points) - height) * planar_speed(frames, world, index)
+    clearance = frame_clearance(world, scan, index, points)
+    return clearance_error(world, episodes, frames, clearance, index, command, height, threshold)
 
 
 @needs(memory_each=1, points="points")
@@ -80,10 +80,10 @@ def swung_foot_height_error(
 
     It counts while the command asks for more than ``threshold``.
 
-    mjlab: feet_swing_height. Isaac Lab: -.
+    mjlab: feet_swing_height.
     """
     clearance = frame_clearance(world, scan, index, points)
-    return swing_error(world, episodes, contacts, index, command, memory, clearance, height, threshold)
+    return swing_error(world, episodes, contacts, clearance, index, command, memory, height, threshold)
 
 
 @wp.func
@@ -126,7 +126,7 @@ def body_upright_on_ground(
 
     At most ``most`` points count, evenly chosen; where they are near no plane the normal is up.
 
-    mjlab: upright (with terrain sensors). Isaac Lab: -.
+    mjlab: upright (with terrain sensors).
     """
     local = wp.quat_rotate_inv(body_rotation_of(bodies, world, body), nearest_plane_normal(scan, world, most))
-    return wp.exp(-(local[0] * local[0] + local[1] * local[1]) / (std * std))
+    return likeness(planar_squared(local), std)

@@ -15,15 +15,18 @@ from worker.simulation.sensors.selection import SelectionArrays, chosen_one, obj
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.declare.term_needs import needs
 from worker.tasks.terms import manipulation
+from worker.tasks.terms.composing import composed
+from worker.tasks.terms.root import root_height
 
 wp.set_module_options({"enable_backward": False})
+
 
 TRIES = wp.constant(16)
 """Number of draws of an object's place before it is put above the others."""
 
 
 @wp.func
-def touches_others(
+def _touches_others(
     world: int, worlds: WorldArrays, objects: SelectionArrays, count: int, place: wp.vec3, apart: float
 ) -> bool:
     """Whether a place is closer than ``apart`` [m], seen from above, to one of the first ``count`` objects."""
@@ -58,7 +61,7 @@ def lift_one_command(
     Place and yaw of all objects are drawn from the same ranges of the world frame [m, rad], and drawn again if the object is closer than
     ``apart`` to an earlier one, seen from above [m]; after 16 tries it is placed above all others.
 
-    mjlab: MultiCubeLiftingCommand (whose cubes may be put into one another). Isaac Lab: -.
+    mjlab: MultiCubeLiftingCommand (whose cubes may be put into one another).
     """
     episodes.memory[world, command] = wp.randf(stream, x[0], x[1])
     episodes.memory[world, command + 1] = wp.randf(stream, y[0], y[1])
@@ -76,7 +79,7 @@ def lift_one_command(
                     wp.randf(stream, object_y[0], object_y[1]),
                     wp.randf(stream, object_z[0], object_z[1]),
                 )
-                touching = touches_others(world, worlds, objects, index, place, apart)
+                touching = _touches_others(world, worlds, objects, index, place, apart)
         if touching:
             place[2] = place[2] + float(index) * (apart + object_z[1] - object_z[0])
         one = object_at(objects, index)
@@ -90,7 +93,7 @@ def lift_one_command(
 def object_is_chosen(world: int, objects: SelectionArrays, index: int) -> float:
     """1 for the chosen object, 0 for the others: a one-hot vector over all objects.
 
-    mjlab: camera_target_cube_mask (which shows it in an image). Isaac Lab: -.
+    mjlab: camera_target_cube_mask (which shows it in an image).
     """
     return objects.chosen[world, index]
 
@@ -100,10 +103,7 @@ def object_is_chosen(world: int, objects: SelectionArrays, index: int) -> float:
 def hand_to_each_object(
     world: int, worlds: WorldArrays, robot: RobotArrays, hand: FrameArrays, objects: SelectionArrays, index: int
 ) -> wp.vec3:
-    """Vector from the hand to each object, along the axes of the robot's root [m].
-
-    mjlab: -. Isaac Lab: -.
-    """
+    """Vector from the hand to each object, along the axes of the robot's root [m]."""
     return manipulation.hand_to_object(world, worlds, robot, object_at(objects, index), hand)
 
 
@@ -111,61 +111,34 @@ def hand_to_each_object(
 def hand_to_chosen_object(
     world: int, worlds: WorldArrays, robot: RobotArrays, hand: FrameArrays, objects: SelectionArrays
 ) -> wp.vec3:
-    """Vector from the hand to the chosen object, along the axes of the robot's root [m].
-
-    mjlab: -. Isaac Lab: -.
-    """
+    """Vector from the hand to the chosen object, along the axes of the robot's root [m]."""
     return manipulation.hand_to_object(world, worlds, robot, chosen_one(objects, world), hand)
 
 
 @needs(command=3)
-@wp.func
-def chosen_object_to_target(
-    world: int,
-    worlds: WorldArrays,
-    episodes: EpisodeArrays,
-    robot: RobotArrays,
-    objects: SelectionArrays,
-    command: int,
-) -> wp.vec3:
-    """Vector from the chosen object to its target, along the axes of the robot's root [m].
-
-    mjlab: -. Isaac Lab: -.
-    """
-    return manipulation.object_to_target(world, worlds, episodes, robot, chosen_one(objects, world), command)
+@composed(manipulation.object_to_target, other=chosen_one)
+def chosen_object_to_target():
+    """Vector from the chosen object to its target, along the axes of the robot's root [m]."""
 
 
-@wp.func
-def chosen_object_height(world: int, worlds: WorldArrays, objects: SelectionArrays) -> float:
-    """Height of the chosen object above z = 0 [m].
-
-    mjlab: -. Isaac Lab: -.
-    """
-    return root_position_of(worlds, chosen_one(objects, world), world)[2]
+@composed(root_height, robot=chosen_one)
+def chosen_object_height():
+    """Height of the chosen object above z = 0 [m]."""
 
 
 @needs(command=3)
-@wp.func
-def chosen_object_target_distance(
-    world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int
-) -> float:
-    """Distance between the chosen object and its target [m].
-
-    mjlab: position_error (of MultiCubeLiftingCommand). Isaac Lab: -.
-    """
-    return manipulation.object_target_distance(world, worlds, episodes, chosen_one(objects, world), command)
+@composed(manipulation.object_target_distance, robot=chosen_one)
+def chosen_object_target_distance():
+    """Distance between the chosen object and its target [m]. mjlab: position_error (of MultiCubeLiftingCommand)."""
 
 
 @needs(command=3)
-@wp.func
-def bring_chosen_object(
-    world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int, std: float
-) -> float:
+@composed(manipulation.bring_object, robot=chosen_one)
+def bring_chosen_object():
     """exp(-d^2 / std^2), d the distance between the chosen object and its target [m].
 
-    mjlab: multi_cube_bring_object_reward. Isaac Lab: -.
+    mjlab: multi_cube_bring_object_reward.
     """
-    return manipulation.bring_object(world, worlds, episodes, chosen_one(objects, world), command, std)
 
 
 @needs(command=3)
@@ -182,7 +155,7 @@ def reach_and_bring_chosen_object(
 ) -> float:
     """r (1 + b), with r and b of ``reach_and_bring_object`` for the chosen object, in [0, 2]; the others earn nothing.
 
-    mjlab: multi_cube_staged_position_reward. Isaac Lab: -.
+    mjlab: multi_cube_staged_position_reward.
     """
     return manipulation.reach_and_bring_object(
         world, worlds, episodes, chosen_one(objects, world), hand, command, reaching_std, bringing_std
@@ -190,31 +163,18 @@ def reach_and_bring_chosen_object(
 
 
 @needs(command=3)
-@wp.func
-def chosen_object_at_target(
-    world: int, worlds: WorldArrays, episodes: EpisodeArrays, objects: SelectionArrays, command: int, distance: float
-) -> float:
+@composed(manipulation.object_at_target, robot=chosen_one)
+def chosen_object_at_target():
     """1 while the chosen object is closer to its target than ``distance`` [m], else 0.
 
-    mjlab: at_goal (of MultiCubeLiftingCommand). Isaac Lab: -.
+    mjlab: at_goal (of MultiCubeLiftingCommand).
     """
-    return manipulation.object_at_target(world, worlds, episodes, chosen_one(objects, world), command, distance)
 
 
 @needs(command=3, memory=1)
-@wp.func
-def chosen_object_was_at_target(
-    world: int,
-    worlds: WorldArrays,
-    episodes: EpisodeArrays,
-    objects: SelectionArrays,
-    command: int,
-    memory: int,
-    distance: float,
-) -> float:
+@composed(manipulation.object_was_at_target, robot=chosen_one)
+def chosen_object_was_at_target():
     """1 once the chosen object was closer to its target than ``distance`` [m], until the episode ends.
 
-    mjlab: episode_success (of MultiCubeLiftingCommand, which forgets it when a target is drawn). Isaac Lab: -.
+    mjlab: episode_success (of MultiCubeLiftingCommand, which forgets it when a target is drawn).
     """
-    one = chosen_one(objects, world)
-    return manipulation.object_was_at_target(world, worlds, episodes, one, command, memory, distance)

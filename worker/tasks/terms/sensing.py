@@ -4,22 +4,17 @@ from __future__ import annotations
 
 import warp as wp
 
-from worker.simulation.kinematics import turn_element, unique_quaternion
 from worker.simulation.sensors.frames import FrameArrays
 from worker.simulation.sensors.imu import ImuArrays
 from worker.simulation.sensors.momentum import MomentumArrays
-from worker.simulation.sensors.rays import RayArrays
-from worker.tasks.declare.term_needs import needs
+from worker.tasks.terms.composing import composed, length_squared
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
 def imu_angular_velocity(world: int, imu: ImuArrays) -> wp.vec3:
-    """Angular velocity, in the unit's own frame [rad/s].
-
-    mjlab: builtin_sensor (a gyro). Isaac Lab: imu_ang_vel.
-    """
+    """Angular velocity, in the unit's own frame [rad/s]. mjlab: builtin_sensor (a gyro). Isaac Lab: imu_ang_vel."""
     return imu.gyro[world]
 
 
@@ -33,158 +28,20 @@ def imu_linear_velocity(world: int, imu: ImuArrays) -> wp.vec3:
 
 
 @wp.func
-def imu_acceleration(world: int, imu: ImuArrays) -> wp.vec3:
-    """Acceleration minus gravity, in the unit's own frame [m/s^2]; at rest it points up.
-
-    mjlab: builtin_sensor (an accelerometer). Isaac Lab: imu_lin_acc.
-    """
-    return imu.accelerometer[world]
-
-
-@wp.func
-def imu_orientation(world: int, imu: ImuArrays) -> wp.quat:
-    """Rotation from the unit to the world frame, a quaternion xyzw whose w is not negative.
-
-    mjlab: builtin_sensor (a framequat, wxyz). Isaac Lab: imu_orientation (wxyz).
-    """
-    return unique_quaternion(imu.rotations[world])
-
-
-@wp.func
-def imu_projected_gravity(world: int, imu: ImuArrays) -> wp.vec3:
-    """Direction of gravity, a unit vector, in the unit's own frame.
-
-    mjlab: projected_gravity_from_sensor. Isaac Lab: imu_projected_gravity.
-    """
-    return wp.quat_rotate_inv(imu.rotations[world], wp.vec3(0.0, 0.0, -1.0))
-
-
-@wp.func
-def imu_acceleration_squared(world: int, imu: ImuArrays, gravity: float = 9.81) -> float:
-    """Square of the unit's acceleration without ``gravity`` [m^2/s^4]: 0 at rest.
-
-    mjlab: -. Isaac Lab: body_lin_acc_l2 (of the body that it is on).
-    """
-    up = wp.quat_rotate_inv(imu.rotations[world], wp.vec3(0.0, 0.0, gravity))
-    return wp.length_sq(imu.accelerometer[world] - up)
-
-
-@wp.func
-def frame_position(world: int, frames: FrameArrays, index: int) -> wp.vec3:
-    """Position of a frame's origin, in the frame that the sensor refers to [m].
-
-    mjlab: builtin_sensor (a framepos). Isaac Lab: target_pos_source (of a frame transformer's data).
-    """
-    return frames.positions[world, index]
-
-
-@wp.func
 def frame_height(world: int, frames: FrameArrays, index: int) -> float:
-    """Height of a frame's origin, along z of the frame that the sensor refers to [m].
-
-    mjlab: foot_height (on flat ground). Isaac Lab: -.
-    """
+    """Height of a frame's origin along z of the sensor's reference [m]. mjlab: foot_height (on flat ground)."""
     return frames.positions[world, index][2]
-
-
-@wp.func
-def frame_orientation(world: int, frames: FrameArrays, index: int) -> wp.quat:
-    """Rotation of a frame, a quaternion xyzw whose w is not negative.
-
-    mjlab: builtin_sensor (a framequat, wxyz). Isaac Lab: target_quat_source (of a frame transformer's data, wxyz).
-    """
-    return unique_quaternion(frames.rotations[world, index])
-
-
-@needs(size=6)
-@wp.func
-def frame_orientation_element(world: int, frames: FrameArrays, index: int) -> float:
-    """Element ``index``, one of six, of the first two columns of the rotation matrix of the sensor's first frame, row by row.
-
-    mjlab: -. Isaac Lab: -.
-    """
-    return turn_element(frames.rotations[world, 0], index)
-
-
-@wp.func
-def frame_linear_velocity(world: int, frames: FrameArrays, index: int) -> wp.vec3:
-    """Velocity of a frame's origin [m/s].
-
-    mjlab: builtin_sensor (a framelinvel). Isaac Lab: -.
-    """
-    return frames.linear[world, index]
-
-
-@wp.func
-def frame_angular_velocity(world: int, frames: FrameArrays, index: int) -> wp.vec3:
-    """Angular velocity of a frame [rad/s].
-
-    mjlab: builtin_sensor (a frameangvel). Isaac Lab: -.
-    """
-    return frames.angular[world, index]
-
-
-@wp.func
-def frame_velocity_in_own_frame(world: int, frames: FrameArrays, index: int) -> wp.vec3:
-    """Velocity of a frame's origin, along the frame's own axes [m/s].
-
-    mjlab: ee_velocity. Isaac Lab: -.
-    """
-    return wp.quat_rotate_inv(frames.rotations[world, index], frames.linear[world, index])
 
 
 @wp.func
 def angular_momentum(world: int, momentum: MomentumArrays) -> wp.vec3:
     """Angular momentum about the common centre of mass, in the world frame [kg m^2/s].
 
-    mjlab: builtin_sensor (a subtreeangmom). Isaac Lab: -.
+    mjlab: builtin_sensor (a subtreeangmom).
     """
     return momentum.angular[world]
 
 
-@wp.func
-def angular_momentum_squared(world: int, momentum: MomentumArrays) -> float:
-    """Square of the angular momentum about the common centre of mass [kg^2 m^4/s^2].
-
-    mjlab: angular_momentum_penalty. Isaac Lab: -.
-    """
-    return wp.length_sq(momentum.angular[world])
-
-
-@wp.func
-def center_of_mass_velocity(world: int, momentum: MomentumArrays) -> wp.vec3:
-    """Velocity of the common centre of mass, in the world frame [m/s].
-
-    mjlab: builtin_sensor (a subtreelinvel). Isaac Lab: -.
-    """
-    return momentum.velocities[world]
-
-
-@wp.func
-def center_of_mass(world: int, momentum: MomentumArrays) -> wp.vec3:
-    """Common centre of mass, in the world frame [m].
-
-    mjlab: builtin_sensor (a subtreecom). Isaac Lab: -.
-    """
-    return momentum.centers[world]
-
-
-@wp.func
-def ray_distance(world: int, rays: RayArrays, index: int) -> float:
-    """Distance to what a ray hits [m], of each ray; at most ``max_distance`` of the ``RayCaster``.
-
-    mjlab: builtin_sensor (distances of a RayCastSensor). Isaac Lab: ray_hits_w (of a RayCaster's data, as points).
-    """
-    return rays.distances[world, index]
-
-
-@wp.func
-def nearest_obstacle(world: int, rays: RayArrays) -> float:
-    """Distance to the nearest hit of any ray [m].
-
-    mjlab: -. Isaac Lab: -.
-    """
-    nearest = float(wp.inf)
-    for ray in range(rays.distances.shape[1]):
-        nearest = wp.min(nearest, rays.distances[world, ray])
-    return nearest
+@composed(length_squared, angular_momentum)
+def angular_momentum_squared():
+    """Square of the angular momentum about the centre of mass [kg^2 m^4/s^2]. mjlab: angular_momentum_penalty."""

@@ -63,15 +63,6 @@ def posture_within(
 
 
 @wp.func
-def tolerant_posture(world: int, worlds: WorldArrays, robot: RobotArrays, tolerances: ToleranceArrays) -> float:
-    """exp(-mean of e^2 / s^2) over the joints of ``tolerances``, e the distance of each from its default and s its ``standing`` [rad, m].
-
-    mjlab: posture. Isaac Lab: -.
-    """
-    return posture_within(worlds, robot, tolerances.columns, tolerances.standing, world)
-
-
-@wp.func
 def commanded_posture(
     world: int,
     worlds: WorldArrays,
@@ -86,12 +77,12 @@ def commanded_posture(
 
     Commands of at least ``walking`` or ``running`` use those tolerances: speed [m/s] + turning velocity [rad/s].
 
-    mjlab: variable_posture. Isaac Lab: -.
+    mjlab: variable_posture.
     """
-    asked = command_speed(world, episodes, command)
-    if asked < walking:
+    commanded = command_speed(world, episodes, command)
+    if commanded < walking:
         return posture_within(worlds, robot, tolerances.columns, tolerances.standing, world)
-    if asked < running:
+    if commanded < running:
         return posture_within(worlds, robot, tolerances.columns, tolerances.walking, world)
     return posture_within(worlds, robot, tolerances.columns, tolerances.running, world)
 

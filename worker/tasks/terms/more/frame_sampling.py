@@ -69,9 +69,9 @@ class AdaptiveSampling:
             ("reach", self.reach >= 1, "a whole number >= 1"),
             ("decay", 0 < self.decay <= 1, "a number > 0, at most 1"),
         )
-        for name, fits, wanted in ranges:
+        for name, fits, expected in ranges:
             if not fits:
-                raise ValueError(f"AdaptiveSampling.{name} is {getattr(self, name)}; use {wanted}")
+                raise ValueError(f"AdaptiveSampling.{name} is {getattr(self, name)}; use {expected}")
 
 
 @wp.func
@@ -127,8 +127,8 @@ def _share(even: float, reach: int, decay: float, sampling: SamplingArrays, sums
         weight = float(1.0)
         share = float(0.0)
         for ahead in range(reach):
-            there = wp.min(part + ahead, parts - 1)
-            share = share + weight * (float(sums[there]) / _SCALE + even / float(parts))
+            reached = wp.min(part + ahead, parts - 1)
+            share = share + weight * (float(sums[reached]) / _SCALE + even / float(parts))
             weight = weight * decay
         total = total + share
         sampling.likely[part] = total

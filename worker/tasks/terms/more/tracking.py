@@ -22,11 +22,12 @@ from worker.simulation.kinematics import (
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks.declare.term_needs import needs
-from worker.tasks.terms.frame_sampling import drawn_frame
-from worker.tasks.terms.motion import MotionArrays
+from worker.tasks.terms.more.frame_sampling import drawn_frame
+from worker.tasks.terms.more.motion import MotionArrays
 from worker.tasks.terms.placing import between, set_joint, within_limits
 
 wp.set_module_options({"enable_backward": False})
+
 
 _NONE = wp.constant(wp.vec3(0.0, 0.0, 0.0))
 """Half widths of numbers that are not drawn."""
@@ -45,7 +46,7 @@ def anchor_pose(bodies: BodyArrays, motion: MotionArrays, world: int) -> wp.tran
 
 
 @wp.func
-def wanted_anchor(motion: MotionArrays, frame: int) -> wp.transform:
+def reference_anchor(motion: MotionArrays, frame: int) -> wp.transform:
     """Pose of the motion's anchor, in the world frame."""
     return wp.transform(motion.positions[frame, motion.anchor], motion.rotations[frame, motion.anchor])
 
@@ -53,11 +54,11 @@ def wanted_anchor(motion: MotionArrays, frame: int) -> wp.transform:
 @wp.func
 def relative_reference(bodies: BodyArrays, motion: MotionArrays, world: int, frame: int, index: int) -> wp.transform:
     """Relative reference of a body, in the world frame, with the motion's height of the anchor."""
-    anchor, wanted = anchor_pose(bodies, motion, world), wanted_anchor(motion, frame)
-    between_both = wp.transform_get_rotation(anchor) * wp.quat_inverse(wp.transform_get_rotation(wanted))
+    anchor, reference = anchor_pose(bodies, motion, world), reference_anchor(motion, frame)
+    between_both = wp.transform_get_rotation(anchor) * wp.quat_inverse(wp.transform_get_rotation(reference))
     turn = yaw_quaternion(between_both)
     place = wp.transform_get_translation(anchor)
-    origin = wp.transform_get_translation(wanted)
+    origin = wp.transform_get_translation(reference)
     place = wp.vec3(place[0], place[1], origin[2])
     position = place + wp.quat_rotate(turn, motion.positions[frame, index] - origin)
     return wp.transform(position, turn * motion.rotations[frame, index])
@@ -115,8 +116,8 @@ def motion_command(
     set_root_velocity(worlds, robot, bodies, world, linear, angular)
     for joint in range(robot.defaults.shape[0]):
         offset = between(stream, 13 + joint, wp.vec2(-joints, joints))
-        there = within_limits(robot, joint, motion.joint_positions[frame, joint] + offset, soft_factor)
-        set_joint(worlds, robot, world, joint, there, motion.joint_velocities[frame, joint])
+        target = within_limits(robot, joint, motion.joint_positions[frame, joint] + offset, soft_factor)
+        set_joint(worlds, robot, world, joint, target, motion.joint_velocities[frame, joint])
 
 
 @needs(command=1)
@@ -124,7 +125,8 @@ def motion_command(
 def advance_motion(world: int, episodes: EpisodeArrays, motion: MotionArrays, command: int):
     """Advance by the frames of one control step; after the last frame :func:`motion_over` is true.
 
-    mjlab: MotionCommand (which starts again elsewhere after the last frame). Isaac Lab: MotionCommand (of BeyondMimic, as mjlab's).
+    mjlab: MotionCommand (which starts again elsewhere after the last frame). Isaac Lab: MotionCommand (of BeyondMimic, as
+    mjlab's).
     """
     episodes.memory[world, command] = episodes.memory[world, command] + motion.rate
     motion.sampling.frames[world] = episodes.memory[world, command]
@@ -141,27 +143,24 @@ def evenness_of_frames(world: int, motion: MotionArrays) -> float:
 
 @wp.func
 def motion_over(world: int, episodes: EpisodeArrays, motion: MotionArrays, command: int) -> bool:
-    """Whether the motion is over; use it as a time-out.
-
-    mjlab: -. Isaac Lab: -.
-    """
+    """Whether the motion is over; use it as a time-out."""
     return episodes.memory[world, command] >= float(motion.roots.shape[0])
 
 
 @wp.func
 def wanted_joint_position(world: int, episodes: EpisodeArrays, motion: MotionArrays, joint: int, command: int) -> float:
-    """Position of a joint in the motion [m, rad].
+    """Joint position in the motion [m, rad].
 
-    mjlab: generated_commands (of MotionCommand, its first half). Isaac Lab: generated_commands (of MotionCommand, its first half).
+    mjlab, Isaac Lab: generated_commands (of MotionCommand, its first half).
     """
     return motion.joint_positions[frame_of(episodes, motion, world, command), joint]
 
 
 @wp.func
 def wanted_joint_velocity(world: int, episodes: EpisodeArrays, motion: MotionArrays, joint: int, command: int) -> float:
-    """Velocity of a joint in the motion [m/s, rad/s].
+    """Joint velocity in the motion [m/s, rad/s].
 
-    mjlab: generated_commands (of MotionCommand, its second half). Isaac Lab: generated_commands (of MotionCommand, its second half).
+    mjlab, Isaac Lab: generated_commands (of MotionCommand, its second half).
     """
     return motion.joint_velocities[frame_of(episodes, motion, world, command), joint]
 
@@ -174,9 +173,9 @@ def wanted_anchor_position(
 
     mjlab: motion_anchor_pos_b. Isaac Lab: motion_anchor_pos_b (of BeyondMimic).
     """
-    wanted = wanted_anchor(motion, frame_of(episodes, motion, world, command))
+    reference = reference_anchor(motion, frame_of(episodes, motion, world, command))
     return wp.transform_point(
-        wp.transform_inverse(anchor_pose(bodies, motion, world)), wp.transform_get_translation(wanted)
+        wp.transform_inverse(anchor_pose(bodies, motion, world)), wp.transform_get_translation(reference)
     )
 
 
@@ -189,9 +188,9 @@ def wanted_anchor_turn(
 
     mjlab: motion_anchor_ori_b. Isaac Lab: motion_anchor_ori_b (of BeyondMimic).
     """
-    wanted = wp.transform_get_rotation(wanted_anchor(motion, frame_of(episodes, motion, world, command)))
+    reference = wp.transform_get_rotation(reference_anchor(motion, frame_of(episodes, motion, world, command)))
     robot_turn = wp.transform_get_rotation(anchor_pose(bodies, motion, world))
-    return turn_element(wp.quat_inverse(robot_turn) * wanted, index)
+    return turn_element(wp.quat_inverse(robot_turn) * reference, index)
 
 
 @wp.func

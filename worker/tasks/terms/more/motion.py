@@ -12,7 +12,7 @@ import torch
 import warp as wp
 
 from worker.simulation.sensors.places import place_names
-from worker.tasks.terms.frame_sampling import AdaptiveSampling, FrameSampling, SamplingArrays
+from worker.tasks.terms.more.frame_sampling import AdaptiveSampling, FrameSampling, SamplingArrays
 
 if TYPE_CHECKING:
     from worker.simulation.robot_view import RobotView
@@ -174,11 +174,11 @@ def _read(file: Path, joints: int, bodies: int) -> dict[str, np.ndarray]:
         )
     frames = data["joint_pos"].shape[0]
     for name, width in _WIDTHS.items():
-        wanted = (frames, bodies, width) if width else (frames, joints)
-        if data[name].shape != wanted or frames == 0:
+        expected = (frames, bodies, width) if width else (frames, joints)
+        if data[name].shape != expected or frames == 0:
             raise ValueError(
                 f"Motion.file: {name} of {file} has the shape {data[name].shape}; the robot has {joints} joints and {bodies} bodies, so "
-                f"it must be {wanted}, with one frame or more"
+                f"it must be {expected}, with one frame or more"
             )
         if not np.isfinite(data[name]).all():
             raise ValueError(f"Motion.file: {name} of {file} has numbers that are not finite")

@@ -1,13 +1,10 @@
-"""``python -m worker.tasks.settings_page`` writes the page of all numbers of the robots' tasks, from their declarations."""
+"""The page of all numbers of the robots' tasks, written from their declarations."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
-
-import warp as wp
 
 from worker.tasks import find_task
 from worker.tasks.compile.tables import Row, numbers, tables
@@ -31,7 +28,7 @@ HEAD = """\
 
 Every default number of `Go1Flat`, `Go1Rough`, `G1Flat`, `G1Rough`, `LiftCube` and `LiftCubes`. An empty cell means that the task does not
 have that row. [tasks.md](../tasks.md#go1flat-go1rough-g1flat-g1rough) explains the terms, the differences from mjlab, and the settings
-that a job's YAML can change. `python -m worker.tasks.settings_page` writes this page from the declarations. For any task, `muster tasks
+that a job's YAML can change. `python -m docs.tools` writes this page from the declarations. For any task, `muster tasks
 NAME` prints its terms with their numbers, its configuration and the curriculum of that; not the settings of its training (networks, PPO),
 and not the solver's options.
 """
@@ -164,8 +161,3 @@ def _cell(key: str, text: str) -> str:
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in line)} |" for line in lines) + "\n"
-
-
-if __name__ == "__main__":
-    wp.config.log_level = wp.LOG_WARNING  # keep its messages on standard output out of the page
-    sys.stdout.write(page())

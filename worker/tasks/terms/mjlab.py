@@ -1,0 +1,15 @@
+"""Our terms by their names in mjlab: ``terms.mjlab.joint_vel_l2`` is ``terms.joint_velocity_squared``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from worker.tasks.terms.aliases import aliases, term_named
+
+
+def __getattr__(name: str) -> Any:
+    return term_named("mjlab", name)
+
+
+def __dir__() -> list[str]:
+    return sorted(aliases("mjlab"))
