@@ -25,6 +25,10 @@ from worker.settings.task import TaskConfig
 
 DEFAULT = "ppo"
 _GROUP = "muster.algorithms"
+_REPLACED = {
+    "worker.learning.plain_ppo:PlainPPO": "algorithm ppo computes the same: set train.algorithm: ppo, with these settings under ppo"
+}
+"""Classes of earlier versions, and what replaces them."""
 
 
 def installed() -> dict[str, str]:
@@ -49,13 +53,15 @@ def find_algorithm(name: str) -> type[Algorithm]:
     """
     if words := clash(entry_points(group=_GROUP), name):
         raise UserError(f"train.algorithm: {words}")
+    if name in _REPLACED:
+        raise UserError(f"train.algorithm: {name} is no longer part of Muster; {_REPLACED[name]}")
     known = installed()
     place = name if ":" in name else known.get(name, "")
     module, _, attribute = place.partition(":")
     if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", place):
-        there = ", ".join(sorted(known)) or "none, since no package is installed here that names any"
+        names = ", ".join(sorted(known)) or "none, since no package is installed here that names any"
         raise UserError(
-            f"train.algorithm: no algorithm is called {shown(name)}; known: {there}, and module:Class of your own"
+            f"train.algorithm: no algorithm is called {shown(name)}; known: {names}, and module:Class of your own"
         )
     if place == name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # as for a user's own task (worker.tasks)
@@ -122,18 +128,19 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
         section: The job's ``train``: settings stand under the algorithm's name, those of a user's own under ``settings``.
     """
     where = section_of(name)
-    given = section.get(where) or {}
+    changes = section.get(where) or {}
     own = getattr(config, name, None)
     base = {item.name: getattr(own, item.name) for item in dataclasses.fields(own) if item.init} if own else {}
     kind: Any = algorithm.config_type
     if not dataclasses.is_dataclass(algorithm.config_type):
         raise UserError(f"train.algorithm: {name}: its config_type must be a dataclass, not {kind.__name__}")
     known = [item.name for item in dataclasses.fields(kind)]
-    for key in given:
+    for key in changes:
         if key not in known:
-            raise UserError(f"train.{where}.{key}: {unknown(key, known, getattr(kind, 'elsewhere', {}))}")
+            hint = getattr(kind, "elsewhere", {}).get(key) or nearest(key, sorted(known))
+            raise UserError(f"train.{where}.{key}: there is no such setting; {hint}")
     try:
-        return kind(**{**base, **given})
+        return kind(**{**base, **changes})
     except (TypeError, ValueError) as error:
         raise UserError(refusal(where, error)) from error
 
@@ -146,10 +153,3 @@ def refusal(where: str, error: TypeError | ValueError) -> str:
     if isinstance(first.get("input"), ArgsKwargs):  # the message of a rule over several fields is complete
         first["input"] = {}
     return f"{'.'.join(map(str, ('train', where, *path_of(first))))}: {explain(first)}"[:1000]
-
-
-def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:
-    """The error for a setting that an algorithm does not have."""
-    if key in elsewhere:
-        return f"there is no such setting; {elsewhere[key]}"
-    return f"there is no such setting; {nearest(key, sorted(known))}"

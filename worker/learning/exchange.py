@@ -9,7 +9,7 @@ import torch
 
 from worker.learning.cuda_graph import Readback
 from worker.learning.distributed import Gang
-from worker.learning.totals import Totals
+from worker.learning.parts import Totals
 
 if TYPE_CHECKING:
     from worker.tasks.run.task import Task

@@ -201,7 +201,7 @@ def user_errors(where: str | None = None) -> Iterator[None]:
 
 
 def run_command(body: Callable[[], int]) -> None:
-    """Run a command and exit with its code: 2 for a user's error, 1 for any other, both told to the supervisor."""
+    """Run a command and exit with its code: 2 for a user's error, 1 for any other, both reported to the supervisor."""
     # Importing the simulation parses hundreds of kernels; garbage collection would make that 50 % slower.
     gc.disable()
     try:

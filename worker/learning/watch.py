@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,11 +24,11 @@ STUCK = 20
 DEAD = 0.01
 """Standard deviation of the actions below which nothing is explored."""
 HISTORY = 2000
-"""Records of earlier attempts that are looked at, spread evenly."""
+"""Number of records of earlier attempts that are read, spread evenly."""
 
 
 class Watch:
-    """Looks at the records of a run in order.
+    """Watches the records of a run, in order.
 
     Args:
         iterations: Iteration at which the training ends.
@@ -42,13 +42,8 @@ class Watch:
         self._best, self._best_at = -math.inf, 0
         self._checks = [_Check(PATIENCE, self._fallen), _Check(0, self._dead), _Check(STUCK, self._stuck)]
 
-    def follow(self, history: Iterable[Mapping[str, Any]]) -> None:
-        """Take in the records of earlier attempts."""
-        for record in history:
-            self.look(record)
-
-    def look(self, record: Mapping[str, Any]) -> list[str]:
-        """What is wrong after the iteration of ``record``, a line each; empty as a rule."""
+    def warnings(self, record: Mapping[str, Any]) -> list[str]:
+        """The problems after the iteration of ``record``, a line each; usually none."""
         reward, episodes = record.get("reward"), record.get("episodes") or 0
         if episodes and _is_finite(reward):
             self._window.append((float(episodes), float(reward or 0.0)))

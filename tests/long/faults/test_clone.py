@@ -14,12 +14,12 @@ from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.initial_weights import parent_checkpoint
 from shared_store.volume.layout import Store
 from tests.support.worker.clones import make_clone
+from tests.support.worker.plain_ppo import PlainPPO
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, tensors, train
 from worker.learning.algorithms import installed
 from worker.learning.loop import Loop
-from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo.fused import PPO
 from worker.settings.errors import UserError
 
@@ -32,7 +32,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "ppo": {},
     "sac": {"algorithm": "sac", "sac": SMALL_SAC},
     "rsl_rl": {"algorithm": "rsl_rl", "rsl_rl": SMALL_RSL},
-    "own": {"algorithm": "worker.learning.plain_ppo:PlainPPO", "settings": {"hidden_sizes": [8], "steps": 8}},
+    "own": {"algorithm": "tests.support.worker.plain_ppo:PlainPPO", "settings": {"hidden_sizes": [8], "steps": 8}},
 }
 """The training of each kind of algorithm."""
 

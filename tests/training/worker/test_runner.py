@@ -205,12 +205,12 @@ def test_a_save_that_the_volume_refuses_is_reported_and_training_goes_on(
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
     ended = training(tmp_path, iterations=4, epoch=2)
     stop = StopRequest()
-    monkeypatch.setattr("worker.learning.completion.sleep", lambda _: setattr(stop, "requested", True))
+    monkeypatch.setattr("worker.learning.leaving.sleep", lambda _: setattr(stop, "requested", True))
     with pytest.raises(TrainingError, match="its last checkpoint could not be saved"):
         train_with_obstacle(ended, obstacles[1], stop)
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
     obstacles[1].unlink()
-    monkeypatch.setattr("worker.learning.completion.sleep", lambda _: obstacles[1].unlink(missing_ok=True))
+    monkeypatch.setattr("worker.learning.leaving.sleep", lambda _: obstacles[1].unlink(missing_ok=True))
     train_with_obstacle(ended, obstacles[1])
     assert "its last checkpoint is not saved yet; trying again in 1 s" in capsys.readouterr().out
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3, 4]

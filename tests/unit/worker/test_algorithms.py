@@ -18,6 +18,7 @@ import warp
 from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
 from tests.support.worker.loop import alone
+from tests.support.worker.plain_ppo import PlainPPO
 from tests.support.worker.point_task import Point, PointConfig
 from worker.learning import algorithms
 from worker.learning.algorithm import WorldShare
@@ -32,8 +33,7 @@ from worker.learning.algorithms import (
 )
 from worker.learning.distributed import Gang
 from worker.learning.job import Job
-from worker.learning.plain_ppo import PlainPPO
-from worker.learning.ppo import draws, objective
+from worker.learning.ppo import draws, heads
 from worker.learning.sac import kernels
 from worker.learning.setup import build_algorithm, load_kernels
 from worker.settings.errors import UserError
@@ -116,7 +116,7 @@ class InTurn(Gang):
         self.turn = None
 
 
-@pytest.mark.parametrize(("name", "modules"), [("ppo", (draws, objective)), ("sac", (kernels,)), ("rsl_rl", ())])
+@pytest.mark.parametrize(("name", "modules"), [("ppo", (draws, heads)), ("sac", (kernels,)), ("rsl_rl", ())])
 def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algorithm(
     monkeypatch: pytest.MonkeyPatch, name: str, modules: tuple[Any, ...]
 ) -> None:
@@ -185,6 +185,11 @@ def test_a_name_of_no_algorithm_is_refused_with_those_that_there_are(name: str) 
     assert refusal(find_algorithm, name, error=UserError) == (
         f"train.algorithm: no algorithm is called {name!r}; known: ppo, rsl_rl, sac, and module:Class of your own"
     )
+
+
+def test_a_class_of_an_earlier_version_is_refused_with_its_replacement() -> None:
+    with pytest.raises(UserError, match=r"PlainPPO is no longer part of Muster; .*: set train.algorithm: ppo, with"):
+        find_algorithm("worker.learning.plain_ppo:PlainPPO")
 
 
 def test_an_uninstalled_source_tree_has_its_own_algorithms(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,11 +21,9 @@ from shared_store.volume.layout import Run, Store
 from shared_store.volume.paired_episodes import are_paired, paired
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.worker.loop import alone
-from worker.evaluation.blocks import SIZE, Blocks
-from worker.evaluation.episodes import Episodes, Stopped, play
-from worker.evaluation.evaluation import best_words, result_of
+from worker.evaluation.episodes import SIZE, Blocks, Episodes, Stopped, play
+from worker.evaluation.evaluation import best_line, result_of, write_table
 from worker.evaluation.statistics import Sample, difference, share
-from worker.evaluation.table import write_table
 from worker.learning.randomness import held_out_seed
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks import terms
@@ -147,7 +145,7 @@ def test_a_success_that_names_nothing_is_refused_and_a_task_without_terminations
 
 def test_a_stopped_evaluation_records_nothing() -> None:
     with pytest.raises(Stopped):
-        play([Cartpole(config(), 2, seed=3)], Push(0.0), GANG, is_asked_to_stop=lambda: True)
+        play([Cartpole(config(), 2, seed=3)], Push(0.0), GANG, is_stop_requested=lambda: True)
 
 
 def test_blocks_of_worlds_have_policies_of_their_own() -> None:
@@ -269,10 +267,10 @@ def test_the_end_of_a_training_names_the_best_checkpoint_once_there_is_one_to_co
     add_run(store, "taught")
     run, figures = store.run("taught"), {"mean_length": 9.0, "max_length": 10, "episodes": 4, "time": 1.0}
     for iteration, mean in ((3, 7.25), (6, 5.0)):
-        assert best_words(run) == ""
+        assert best_line(run) == ""
         name = add_checkpoint(store, "taught", iteration).name
         write_json(run.evaluations / f"{name}.json", {**figures, "mean_return": mean})
-    assert best_words(run) == f"best of 2 checkpoints that are evaluated: {run.name}@3, mean return 7.25"
+    assert best_line(run) == f"best of 2 checkpoints that are evaluated: {run.name}@3, mean return 7.25"
 
 
 def test_the_interval_of_a_mean_is_student_s() -> None:

@@ -18,12 +18,12 @@ from tensordict import TensorDict
 
 from tests.support.refusals import refusal
 from tests.support.worker.loop import alone, groups, iterate, setting_of, spaces_of
+from tests.support.worker.plain_ppo import Network, PlainPPO
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.distributed import Gang, RankPlacement
-from worker.learning.plain_ppo import Network, PlainPPO
 from worker.learning.ppo.fused import PPO
-from worker.learning.ppo.loss import LOSSES
+from worker.learning.ppo.heads import LOSSES
 
 torch.set_num_threads(1)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -19,17 +20,17 @@ from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.fused import METRICS, PPO
-from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
-from worker.learning.ppo.objective import Objective
+from worker.learning.ppo.heads import Gaussian
+from worker.learning.ppo.networks import build_actor
 from worker.learning.randomness import mix_seed
 from worker.settings.ppo import PPOConfig
 
 
-def make(worlds: int = 4, first: int = 0, total: int | None = None, *, plain: bool = False, **settings: object) -> PPO:
+def make(worlds: int = 4, first: int = 0, total: int | None = None, **settings: object) -> PPO:
     torch.manual_seed(5)
     share = WorldShare(first, worlds, total or worlds)
     spaces = Spaces({"policy": (2,), "critic": (2,)}, 1)
-    return PPO(dataclasses.replace(PointPPO(), **settings), LearningSetting(spaces, share, alone(), 1), plain=plain)
+    return PPO(dataclasses.replace(PointPPO(), **settings), LearningSetting(spaces, share, alone(), 1))
 
 
 def groups(observations: torch.Tensor) -> TensorDict:
@@ -323,69 +324,48 @@ def test_gradients_of_a_layer_are_those_of_torch(missing: int) -> None:
 
 
 @pytest.mark.parametrize("clip_values", [True, False])
-def test_the_objective_and_its_gradient_are_those_of_torch_and_of_the_plain_loss(clip_values: bool) -> None:
+def test_the_loss_and_its_gradient_are_those_of_torch(clip_values: bool) -> None:
     """Far from the old policy too, where ratios and values are clipped on either side."""
     torch.manual_seed(3)
-    samples, actions, clip, value_coef, entropy_coef, weight = 500, 3, 0.2, 0.7, 0.02, 0.4
+    samples, actions, clip, weight = 500, 3, 0.2, 0.4
+    config = PPOConfig(clip=clip, clip_values=clip_values, value_loss_coef=0.7, entropy_coef=0.02)
     drawn, old_mean, mean = (0.7 * torch.randn(samples, actions) for _ in range(3))
     old_std, std = torch.tensor([0.9, 1.0, 1.2]), torch.tensor([1.0, 0.8, 1.3])
-    old_log_prob = Normal(old_mean, old_std).log_prob(drawn).sum(1)
     advantages, returns, old_values, values = (torch.randn(samples) for _ in range(4))
-    leaves = [each.requires_grad_() for each in (mean, std, values.unsqueeze(1))]
+    actor = build_actor(config, Spaces({"policy": (2,)}, actions))
+    actor.distribution.std_param.data.copy_(std)
+    head = Gaussian(actor, samples, weight, config)
+    head.std.copy_(old_std)
+    leaves = [mean.requires_grad_(), actor.distribution.std_param, values.unsqueeze(1).requires_grad_()]
+    order = torch.randperm(samples)
 
-    policy, value = Normal(mean, std), leaves[2][:, 0]
+    def rolled(each: torch.Tensor) -> torch.Tensor:
+        return each[order.argsort()].unsqueeze(1)
+
+    rollout = SimpleNamespace(actions=rolled(drawn), outputs=rolled(old_mean), advantages=rolled(advantages))
+    rollout.returns, rollout.values = rolled(returns), rolled(old_values)
+    old_log_prob = Normal(old_mean, old_std).log_prob(drawn).sum(1)
+    rollout.log_prob = head.log_prob(rollout)
+    torch.testing.assert_close(rollout.log_prob, rolled(old_log_prob))
+
+    policy, value = Normal(mean, leaves[1]), leaves[2][:, 0]
     ratio = (policy.log_prob(drawn).sum(1) - old_log_prob).exp()
     surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1 - clip, 1 + clip)).mean()
     near = old_values + (value - old_values).clamp(-clip, clip) if clip_values else value
     value_loss = torch.max((value - returns).square(), (near - returns).square()).mean()
     entropy = policy.entropy().sum(1).mean()
     kl = torch.distributions.kl_divergence(Normal(old_mean, old_std), policy).sum(1).mean()
-    loss = weight * (surrogate + value_coef * value_loss - entropy_coef * entropy)
+    loss = weight * (surrogate + 0.7 * value_loss - 0.02 * entropy)
     expected = [*torch.autograd.grad(loss, leaves), weight * torch.stack((surrogate, value_loss, entropy, kl)).detach()]
     assert (ratio < 1 - clip).any() and (ratio > 1 + clip).any()
 
-    settings = Clipping(clip, clip_values, value_coef, entropy_coef)
-    told = Samples(old_log_prob, advantages, returns, old_values)
-    plain, losses = clipped_loss(settings, told, *gaussian_terms(drawn, old_mean, old_std, mean, std), leaves[2][:, 0])
-    found = [*torch.autograd.grad(weight * plain, leaves), weight * losses]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
-
-    order = torch.randperm(samples)
-    rollout = tuple(each[order.argsort()] for each in (drawn, old_mean, old_log_prob, advantages, returns, old_values))
-    objective = Objective(samples, actions, "cpu", weight=weight, settings=settings)
-    losses = objective.backward(order, rollout, old_std, *leaves)
+    losses = head.backward(order, rollout, mean, leaves[2])
     torch.testing.assert_close([*(each.grad for each in leaves), losses], expected, rtol=1e-4, atol=1e-6)
+    assert int(head.clipped.sum()) == int(((ratio - 1).abs() > clip).sum())
 
     mean.data[7, 0] = float("nan")
-    assert objective.backward(order, rollout, old_std, *leaves)[[0, 3]].isnan().all()
+    assert head.backward(order, rollout, mean, leaves[2])[[0, 3]].isnan().all()
     assert mean.grad[7].isnan().all()
-
-
-def test_choices_are_those_of_torch() -> None:
-    torch.manual_seed(6)
-    old, new = torch.randn(50, 5), torch.randn(50, 5)
-    choices = torch.randint(0, 5, (50, 1))
-    log_prob, entropy, kl = categorical_terms(choices.float(), old, new)
-    policy, before = (torch.distributions.Categorical(logits=each) for each in (new, old))
-    torch.testing.assert_close(log_prob, policy.log_prob(choices[:, 0]))
-    torch.testing.assert_close(entropy, policy.entropy())
-    torch.testing.assert_close(kl, torch.distributions.kl_divergence(before, policy))
-
-
-def played(ppo: PPO) -> dict[str, torch.Tensor]:
-    """The networks after some iterations on the point task."""
-    task = Point(PointConfig(), ppo.setting.share.count)
-    iterate(ppo, task, 0, 3)
-    return {**ppo.actor.state_dict(), **{f"critic.{name}": each for name, each in ppo.critic.state_dict().items()}}
-
-
-@pytest.mark.parametrize(
-    "settings", [{}, {"clip_values": False}, {"schedule": "fixed"}, {"critic_observations": "critic"}]
-)
-def test_whole_updates_are_those_of_the_plain_loss(settings: dict[str, object]) -> None:
-    fused, plain = played(make(**settings)), played(make(plain=True, **settings))
-    for name, tensor in fused.items():
-        torch.testing.assert_close(tensor, plain[name], rtol=1e-3, atol=1e-5, msg=name)
 
 
 def test_unsupported_settings_are_refused_by_name() -> None:

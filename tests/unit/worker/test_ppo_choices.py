@@ -14,7 +14,7 @@ from tests.support.worker.point_task import PointPPO
 from worker.learning.algorithm import LearningSetting, Spaces, WorldShare
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.fused import PPO
-from worker.learning.ppo.loss import Clipping, Samples, clipped_loss
+from worker.learning.ppo.heads import Samples, clipped_loss
 from worker.learning.ppo.networks import ActorPolicy, PixelModel, build_actor, build_critic
 from worker.settings.ppo import PPOConfig
 
@@ -63,14 +63,12 @@ def test_the_gradient_of_choices_is_that_of_torch_by_the_rows_of_the_minibatch()
     copies = [each.detach().clone().requires_grad_() for each in (outputs, values)]
     policy, old = Categorical(logits=copies[0]), Categorical(logits=rollout.outputs.flatten(0, 1)[rows])
     samples = [each.flatten()[rows] for each in (expected, rollout.advantages, rollout.returns, rollout.values)]
-    config = ppo.config
-    clipping = Clipping(config.clip, config.clip_values, config.value_loss_coef, config.entropy_coef)
     terms = (
         policy.log_prob(rollout.actions.flatten()[rows]),
         policy.entropy(),
         torch.distributions.kl_divergence(old, policy),
     )
-    loss, means = clipped_loss(clipping, Samples(*samples), *terms, copies[1][:, 0])
+    loss, means = clipped_loss(ppo.config, Samples(*samples), *terms, copies[1][:, 0])
     loss.backward()
     torch.testing.assert_close(losses, means)
     for mine, its in zip((outputs, values), copies, strict=True):

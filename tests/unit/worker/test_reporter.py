@@ -17,7 +17,7 @@ from shared_store.volume.epoch import StaleEpoch, check_epoch, raise_epoch
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import read_metrics, scalars
 from tests.support.waiting import wait_for
-from worker.evaluation.reward_plot import plot_reward
+from worker.evaluation.final_evaluation import plot_reward
 from worker.learning import reporter as reporting
 from worker.learning.report import Report
 from worker.learning.reporter import Fence, Gate, Reporter

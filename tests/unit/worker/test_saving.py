@@ -19,9 +19,8 @@ from tests.support.shared_store.operations import durable_operations
 from tests.support.waiting import wait_for
 from worker.checkpoint_writer import Orders, save
 from worker.learning import saving
-from worker.learning.beacon import Beacon
-from worker.learning.cadence import Cadence
-from worker.learning.saving import Saver
+from worker.learning.reporter import Beacon
+from worker.learning.saving import Cadence, Saver
 
 
 @pytest.fixture
@@ -173,11 +172,11 @@ def test_the_beacon_never_waits_and_survives_a_supervisor_that_is_gone() -> None
     read, write = os.pipe2(os.O_NONBLOCK)
     beacon = Beacon({"MUSTER_PROGRESS_FD": str(write)})
     for iteration in range(20_000):
-        beacon.tell(iteration=iteration)
+        beacon.send(iteration=iteration)
     os.close(read)
-    beacon.tell(iteration=1)
-    beacon.tell(iteration=2)
-    Beacon({}).tell(iteration=3)
+    beacon.send(iteration=1)
+    beacon.send(iteration=2)
+    Beacon({}).send(iteration=3)
     os.close(write)
 
 

@@ -15,7 +15,7 @@ from torch import nn
 from torch.nn.functional import softplus
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
-from worker.learning.observations import made_up
+from worker.learning.observations import synthetic
 from worker.settings.sac import LOG_STD, SACConfig
 
 HEAD_SCALE = 0.01
@@ -176,8 +176,8 @@ class SquashedPolicy:
     def module(self) -> ExportedPolicy:
         """The mean action as a function of ``obs``, shape (batch, observations); the observations are normalised inside."""
         network = _Best(self.actor)
-        seen = made_up({POLICY: (self.actor.observations,)}, network.actor.normalizer)
-        return ExportedPolicy(network, {"obs": seen[POLICY][:1]}, ("actions",), seen)
+        sample = synthetic({POLICY: (self.actor.observations,)}, network.actor.normalizer)
+        return ExportedPolicy(network, {"obs": sample[POLICY][:1]}, ("actions",), sample)
 
     def state_dict(self) -> Mapping[str, Any]:
         """The actor's tensors, with its normaliser's."""
@@ -194,8 +194,7 @@ class _Best(nn.Module):
 
     def __init__(self, actor: SquashedGaussianActor) -> None:
         super().__init__()
-        self.actor = copy.deepcopy(actor).cpu()
-        self.eval()
+        self.actor = copy.deepcopy(actor).cpu().eval()
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
         return self.actor.best(obs)
