@@ -15,7 +15,6 @@ from worker.learning.algorithm import WorldShare
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.distributed import Gang
-from worker.learning.earlier_settings import as_begun
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.hooks import FaultInjection, Hook
 from worker.learning.incident import Incident
@@ -36,7 +35,7 @@ from worker.learning.setup import (
     write_contract,
 )
 from worker.learning.state import EndedEpisodes, TrainingState
-from worker.learning.training import Training
+from worker.learning.training import Training, as_begun
 from worker.settings.errors import TrainingError, UserError
 from worker.settings.task import value_at
 

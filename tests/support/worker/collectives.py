@@ -186,7 +186,7 @@ TESTS = {
             "learning/distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
             "evaluation/evaluation.py": "evaluate",
             "evaluation/final_evaluation.py": "FinalEvaluation.trained",
-            "learning/earlier_settings.py": "as_begun",
+            "learning/training.py": "as_begun",
             "learning/exchange.py": "Exchange.gather",
             "learning/leaving.py": "train",
             "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._iterate Loop.train",

@@ -28,7 +28,7 @@ from worker.learning.observations import gather_moments, merge_moments
 from worker.learning.randomness import mix_seed
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES, Learner
-from worker.learning.sac.networks import SquashedGaussianActor, SquashedPolicy, check_spaces, size_of
+from worker.learning.sac.networks import SquashedGaussianActor, check_spaces, size_of
 from worker.learning.sac.replay_buffer import ReplayBuffer
 from worker.settings.sac import SACConfig
 
@@ -148,7 +148,8 @@ class SAC:
         """Actions of the policy with its noise, or uniform ones, shape (worlds, actions), float32."""
         for group, columns in zip(self._groups, self.learner.columns, strict=True):
             self._before[:, columns].copy_(observations[group])
-        mean, log_std = self.learner.actor(self._before[:, self.learner.columns[0]])
+        actor, seen = self.learner.actor, self._before[:, self.learner.columns[0]]
+        mean, log_std = actor.spread(actor.normalizer(seen))
         if self._step == 0:
             self._spread.copy_(log_std.exp().mean())
         first, limit = self.share.first, self.config.action_limit
@@ -237,15 +238,15 @@ class SAC:
 
     # -- state --------------------------------------------------------------------------------------------------------
 
-    def policy(self) -> SquashedPolicy:
-        """A live view of the learnt policy."""
-        return SquashedPolicy(self.learner.actor)
+    def policy(self) -> SquashedGaussianActor:
+        """The actor is the policy."""
+        return self.learner.actor
 
     @classmethod
-    def build_policy(cls, config: SACConfig, spaces: Spaces, device: str) -> SquashedPolicy:
+    def build_policy(cls, config: SACConfig, spaces: Spaces, device: str) -> SquashedGaussianActor:
         """A policy that can load the ``policy`` of a :meth:`state_dict`."""
         check_spaces(spaces, (POLICY,))
-        return SquashedPolicy(SquashedGaussianActor(config, size_of(spaces, POLICY), spaces.actions).to(device))
+        return SquashedGaussianActor(config, size_of(spaces, POLICY), spaces.actions).to(device)
 
     def state_dict(self) -> Mapping[str, Any]:
         """Networks, normalisers, temperature, optimizers, and the number of updates."""
