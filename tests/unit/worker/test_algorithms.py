@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -124,32 +122,6 @@ def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algori
     monkeypatch.setattr(warp, "load_module", lambda module, device: loaded.append((module, device, gang.turn)))
     load_kernels(find_algorithm(name), gang)
     assert loaded == [(module, "cpu", "algorithm") for module in modules]
-
-
-def reached(module: str, found: dict[str, Path]) -> dict[str, Path]:
-    """The worker's modules that are imported with this one, by their statements outside of functions."""
-    path = REPOSITORY / module.replace(".", "/")
-    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    if module in found or not file.exists():
-        return found
-    found[module] = file
-    statements = ast.parse(file.read_text()).body
-    imports = [each for each in statements if isinstance(each, ast.Import | ast.ImportFrom)]
-    names = [alias.name for each in imports if isinstance(each, ast.Import) for alias in each.names]
-    for each in imports:
-        if isinstance(each, ast.ImportFrom) and each.module:
-            names += [each.module, *(f"{each.module}.{alias.name}" for alias in each.names)]
-    for name in (*names, module.rpartition(".")[0]):
-        if name.startswith("worker."):
-            reached(name, found)
-    return found
-
-
-def test_the_common_modules_import_no_algorithm() -> None:
-    found = reached("worker.learning.setup", {})
-    assert {"worker.learning.job", "worker.learning.algorithms"} <= found.keys()
-    assert not {name.partition(":")[0] for name in installed().values()} & found.keys()
-    assert reached("worker.learning.ppo.fused", {}).keys() >= {"worker.learning.ppo.draws"}, "it follows imports"
 
 
 ENVIRONMENT = {"MUSTER_STORE": "/store", "MUSTER_RUN": "run"}

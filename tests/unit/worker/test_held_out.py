@@ -47,14 +47,6 @@ def test_a_score_covers_an_episode_of_each_world_and_a_hundred_in_all(
     assert scores(iterations, worlds=worlds, longest=longest) == pytest.approx(expected)
 
 
-def test_a_score_follows_the_newest_episodes_and_one_lucky_iteration_is_not_the_best() -> None:
-    steady = scores([(100, 10.0)] * 8 + [(1, 500.0)] + [(100, 10.0)] * 8, worlds=100, longest=40)
-    assert steady[7] == pytest.approx(10.0) and steady[16] == pytest.approx(10.0)
-    assert max(score for score in steady if score is not None) < 13.0
-    better = scores([(100, 10.0)] * 8 + [(100, 20.0)] * 4, worlds=100, longest=40)
-    assert better[-1] == pytest.approx(20.0)
-
-
 def test_a_score_has_a_standard_error(tmp_path: Path) -> None:
     returns = torch.randn(4, 75, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 3.0 + 800.0
     progress = Progress()

@@ -19,10 +19,9 @@ from tests.support.worker.loop import alone, iterate, transition_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.ppo import linear_layers as linear
-from worker.learning.ppo.fused import METRICS, PPO
+from worker.learning.ppo.fused import PPO
 from worker.learning.ppo.heads import Gaussian
 from worker.learning.ppo.networks import build_actor
-from worker.learning.randomness import mix_seed
 from worker.settings.ppo import PPOConfig
 
 
@@ -85,42 +84,6 @@ def test_a_time_out_bootstraps_from_the_observation_after_the_step() -> None:
     assert ppo.rollout.returns.flatten().tolist() == pytest.approx([3.925, 4.5, 5.6])
 
 
-@pytest.mark.parametrize(
-    ("kl", "before", "after"),
-    [
-        (0.021, 3e-3, 2e-3),
-        (0.019, 3e-3, 3e-3),
-        (0.006, 3e-3, 3e-3),
-        (0.004, 3e-3, 4.5e-3),
-        (0.0, 3e-3, 3e-3),
-        (1.0, 1.2e-5, 1e-5),
-        (0.001, 9e-3, 1e-2),
-    ],
-)
-def test_learning_rate_rule(kl: float, before: float, after: float) -> None:
-    ppo = make(desired_kl=0.01)
-    ppo._rate.fill_(before)
-    ppo._adapt_learning_rate(torch.tensor(kl))
-    assert float(ppo._rate) == pytest.approx(after)
-    assert ppo.optimizer.param_groups[0]["lr"] is ppo._rate
-    fixed = make(schedule="fixed")
-    fixed._adapt_learning_rate(torch.tensor(1.0))
-    assert float(fixed._rate) == pytest.approx(1e-3)
-
-
-def test_the_greatest_rate_falls_after_its_horizon_and_takes_the_present_rate_along() -> None:
-    config = PPOConfig(learning_rate_limits=(1e-4, 1e-2), learning_rate_horizon=50)
-    rates = [config.greatest_rate(iteration) for iteration in (0, 49, 50, 99, 10**6)]
-    assert rates == pytest.approx([1e-2, 1e-2, 1e-2 * 50 / 51, 5e-3, 1e-4])
-    assert PPOConfig(learning_rate_horizon=None).greatest_rate(10**6) == 1e-2
-    ppo = make(learning_rate_horizon=50)
-    ppo._rate.fill_(8e-3)
-    ppo.begin(99)
-    assert float(ppo._rate) == pytest.approx(5e-3)
-    ppo._adapt_learning_rate(torch.tensor(1e-4))  # so small a KL asks for a greater rate
-    assert float(ppo._rate) == pytest.approx(5e-3)
-
-
 @pytest.mark.parametrize(("beyond", "within"), [(-0.001, 0.1), (0.05, 0.1), (3.0, 1.0), (0.5, 0.5)])
 def test_a_deviation_beyond_its_limits_comes_back_and_learns_again(beyond: float, within: float) -> None:
     """A clamp in the forward pass would have no gradient there: a deviation below its floor would be dead for ever."""
@@ -138,43 +101,6 @@ def test_a_deviation_beyond_its_limits_comes_back_and_learns_again(beyond: float
     std.data.fill_(beyond)
     ppo._head.project()
     assert std.tolist() == pytest.approx([within])
-
-
-def test_an_initial_deviation_outside_of_the_limits_widens_them() -> None:
-    assert PPOConfig().std_limits == (0.1, 1.0)
-    assert PPOConfig(init_std=0.05).std_limits == (0.05, 1.0)
-    assert PPOConfig(init_std=2.0).std_limits == (0.1, 2.0)
-    with pytest.raises(ValueError, match=r"min_std: expected at most max_std \(0.2\), got 0.3"):
-        PPOConfig(min_std=0.3, max_std=0.2)
-
-
-def test_normalisers_stay_as_they_are_after_their_horizon() -> None:
-    ppo, task = make(normalizer_horizon=2), Point(PointConfig(), 4)
-    iterate(ppo, task, 0, 2)
-    normalizer = ppo.actor.obs_normalizer
-    kept = {name: tensor.clone() for name, tensor in normalizer.state_dict().items()}
-    assert kept["count"] > 0
-    iterate(ppo, task, 2, 4)
-    assert all(torch.equal(tensor, kept[name]) for name, tensor in normalizer.state_dict().items())
-
-
-def test_metrics_of_a_rollout_by_hand() -> None:
-    """Rewards as in the test of the advantages: returns (1.9, 0, 5.6), values (1, 2, 3)."""
-    torch.manual_seed(5)
-    spaces = Spaces({"policy": (2,), "critic": (2,)}, 1)
-    setting = LearningSetting(spaces, WorldShare(0, 1, 1), alone(), 1, action_ranges=((-0.5, 2.0),))
-    ppo = PPO(dataclasses.replace(PointPPO(), **RETURNS, epochs=1), setting)
-    ppo.critic.mlp = FirstComponent()
-    play(ppo, VALUES, [1, 0, 2], [0, 1, 0], [0, 0, 0], torch.full((3, 2), float("nan")))
-    ppo.rollout.actions.copy_(torch.tensor([[[-0.51]], [[2.0]], [[2.1]]]))
-    ppo._normalize()
-    ppo._head.clipped.copy_(torch.tensor([0.0, 1.0, 1.0]))
-    ppo._gather_figures()
-    ppo._close()
-    found = dict(zip(METRICS, ppo._metrics.tolist(), strict=True))
-    # Var(A) = 10.82 / 3 of A = (0.9, -2, 2.6); Var(G) = (3.61 + 31.36 - 7.5^2 / 3) / 3 = 16.22 / 3
-    assert found["explained_variance"] == pytest.approx(1 - 10.82 / 16.22, abs=1e-4)
-    assert found["saturation"] == pytest.approx(2 / 3) and found["clip_fraction"] == pytest.approx(2 / 3)
 
 
 @pytest.mark.parametrize("device", [False, True])
@@ -225,15 +151,6 @@ def test_noise_is_normal_and_independent() -> None:
     assert float((noise.abs() > 2.0).float().mean()) == pytest.approx(0.0455, abs=0.01)
     for one, two in ((noise[1:], noise[:-1]), (noise[:, 1:], noise[:, :-1])):
         assert abs(float((one * two).mean())) < 0.03
-
-
-def test_shares_cover_all_worlds_once() -> None:
-    shares = [WorldShare.of(rank, 3, 8) for rank in range(3)]
-    assert [(share.first, share.count) for share in shares] == [(0, 2), (2, 3), (5, 3)]
-
-
-def test_seeds_differ() -> None:
-    assert len({mix_seed(1, 2), mix_seed(2, 1), mix_seed(1, 2, 0), mix_seed(12)}) == 4
 
 
 def stock_twin(ppo: PPO, config: PointPPO, worlds: int) -> StockPPO:

@@ -52,12 +52,6 @@ def test_a_fall_that_ends_in_time_or_that_noise_explains_is_not_reported() -> No
     assert not any(begun(watch(), noisy))
 
 
-def test_iterations_without_episodes_change_no_mean() -> None:
-    of = watch()
-    begun(of, RISE)
-    assert not any(of.warnings(record(i)) for i in range(41, 200))
-
-
 def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
     found = begun(watch(60), [*RISE, *([18.5] * 20)])
     assert not any(found[:-1])
