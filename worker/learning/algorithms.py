@@ -87,38 +87,37 @@ def refuse_incomplete(found: object, name: str, parts: Sequence[str]) -> None:
 def check_state(algorithm: Algorithm, name: str) -> None:
     """Raises UserError if the state of an algorithm lacks the policy, which evaluation and export read."""
     if not isinstance(algorithm.state_dict().get("policy"), Mapping):
-        raise UserError(f'train.algorithm: {name}: state_dict() must hold "policy", the state_dict() of its policy')
+        raise _mistake(name, 'state_dict() must hold "policy", the state_dict() of its policy')
 
 
 def check_actions(actions: Any, expected: torch.Size, name: str) -> None:
     """Raises UserError for actions other than a tensor of the ``expected`` shape."""
     if not isinstance(actions, torch.Tensor) or actions.shape != expected:
-        found = tuple(actions.shape) if isinstance(actions, torch.Tensor) else type(actions).__name__
-        raise UserError(
-            f"train.algorithm: {name}: act() must give a tensor of shape {tuple(expected)} (worlds, actions); it gave {found}"
-        )
+        shape = f"a tensor of shape {tuple(expected)} (worlds, actions)"
+        raise _mistake(name, f"act() must give {shape}; it gave {_shape_of(actions)}")
 
 
 def check_metrics(metrics: Any, name: str) -> None:
     """Raises UserError for metrics that are not scalar tensors by name."""
     if not isinstance(metrics, Mapping):
-        raise UserError(
-            f"train.algorithm: {name}: learn() must give a mapping of metrics, not a {type(metrics).__name__}"
-        )
+        raise _mistake(name, f"learn() must give a mapping of metrics, not a {type(metrics).__name__}")
     for key, value in metrics.items():
         if not isinstance(value, torch.Tensor) or value.shape != ():
-            found = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-            raise UserError(
-                f"train.algorithm: {name}: learn() must give tensors of shape (); its metric {key} is {found}"
-            )
+            raise _mistake(name, f"learn() must give tensors of shape (); its metric {key} is {_shape_of(value)}")
 
 
 def check_names(metrics: Collection[str], record: Collection[str], name: str) -> None:
     """Raises UserError for a metric with the name of a number that every record has."""
     if taken := sorted(set(metrics) & set(record)):
-        raise UserError(
-            f"train.algorithm: {name}: a metric of learn() can't be called {taken[0]}: every record has one"
-        )
+        raise _mistake(name, f"a metric of learn() can't be called {taken[0]}: every record has one")
+
+
+def _mistake(name: str, problem: str) -> UserError:
+    return UserError(f"train.algorithm: {name}: {problem}")
+
+
+def _shape_of(value: Any) -> str:
+    return str(tuple(value.shape)) if isinstance(value, torch.Tensor) else type(value).__name__
 
 
 def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section: Mapping[str, Any]) -> Any:

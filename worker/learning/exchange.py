@@ -24,17 +24,11 @@ class Exchange:
 
     def __init__(self, gang: Gang, task: Task) -> None:
         self._gang, self._task = gang, task
-        signals = dict.fromkeys(SIGNALS, 1)
-        self._totals = Totals(
-            {
-                "collected": gang.size,  # [s], of each rank in the iteration before
-                "mishap": gang.size,  # of each rank, see Task.read_mishap
-                "statistics": len(task.statistic_names),
-                **signals,
-            },
-            gang.device,
-        )
-        self._own = Totals({"collected": 1, **signals}, "cpu", pinned=gang.device != "cpu")
+        # of each rank: the seconds of its previous rollout, and its mishap (see Task.read_mishap)
+        of_ranks = {"collected": gang.size, "mishap": gang.size}
+        sizes = {**of_ranks, "statistics": len(task.statistic_names), "signals": len(SIGNALS)}
+        self._totals = Totals(sizes, gang.device)
+        self._own = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
         self._readback = Readback(gang.device)
 
     def gather(self, collected: float, signals: Mapping[str, float]) -> None:
@@ -44,17 +38,15 @@ class Exchange:
             collected: Duration of this rank's previous rollout [s].
             signals: This rank's :data:`SIGNALS`.
         """
-        totals, own, rank = self._totals, self._own, self._gang.rank
+        totals, rank = self._totals, self._gang.rank
         totals.values.zero_()
         totals["mishap"][rank].copy_(self._task.mishap[0])
         totals["statistics"].copy_(self._task.statistics)
         self._task.clear_statistics()
         # the device has copied the previous iteration's values: read() waited for it
-        own["collected"].fill_(collected)
-        totals["collected"][rank : rank + 1].copy_(own["collected"], non_blocking=True)
-        for name in SIGNALS:
-            own[name].fill_(signals[name])
-            totals[name].copy_(own[name], non_blocking=True)
+        self._own.copy_(torch.tensor([collected, *(float(signals[name]) for name in SIGNALS)], dtype=torch.float64))
+        totals["collected"][rank : rank + 1].copy_(self._own[:1], non_blocking=True)
+        totals["signals"].copy_(self._own[1:], non_blocking=True)
         self._gang.sum(totals.values)
 
     def read(self, metrics: Mapping[str, torch.Tensor]) -> tuple[dict[str, float], dict[str, list[float]]]:

@@ -232,7 +232,7 @@ class Loop:
             self.reporter.do(self.fence.guard, self.step_log.write, progress.iteration, self.step_log.taken())
         if self._collecting.can_be_captured:
             self.gate.shut()
-        signals = {name: totals[name][0] for name in SIGNALS}
+        signals = dict(zip(SIGNALS, totals["signals"], strict=True))
         progress.iteration += 1
         self.state.learning_rate = learnt.get("learning_rate")
         self.iterated += 1

@@ -20,10 +20,9 @@ class Totals:
     [0.0, 0.5, 0.0]
     """
 
-    def __init__(self, sizes: Mapping[str, int], device: str, *, pinned: bool = False) -> None:
-        """``pinned``: in pinned host memory, which a GPU copies without a wait of the host."""
+    def __init__(self, sizes: Mapping[str, int], device: str) -> None:
         self.layout = dict(sizes)
-        self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device, pin_memory=pinned)
+        self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device)
         """All parts, one after the other, shape (n,)."""
         parts: Iterable[torch.Tensor] = self.values.split(list(sizes.values()))
         self._parts = dict(zip(sizes, parts, strict=True))
