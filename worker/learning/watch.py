@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 from shared_store.volume.metrics import THIS_RUN
@@ -40,7 +39,10 @@ class Watch:
         self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW)
         self._first: float | None = None
         self._best, self._best_at = -math.inf, 0
-        self._checks = [_Check(PATIENCE, self._fallen), _Check(0, self._dead), _Check(STUCK, self._stuck)]
+        self._checks = (self._fallen, PATIENCE), (self._dead, 0), (self._stuck, STUCK)
+        """Conditions, and the iterations for which each must hold."""
+        self._since = [0] * len(self._checks)
+        """The first iteration of those in which each has held without a break; 0: it does not hold."""
 
     def warnings(self, record: Mapping[str, Any]) -> list[str]:
         """The problems after the iteration of ``record``, a line each; usually none."""
@@ -52,8 +54,12 @@ class Watch:
             self._first = mean if self._first is None else self._first
             if mean > self._best:
                 self._best, self._best_at = mean, record["iteration"]
-        found = [check.after(record) for check in self._checks]
-        if record["iteration"] == self._iterations:
+        iteration, found = record["iteration"], []
+        for number, (check, patience) in enumerate(self._checks):
+            text = check(record)
+            self._since[number] = (self._since[number] or iteration) if text else 0
+            found.append(text if iteration - self._since[number] >= patience else "")
+        if iteration == self._iterations:
             found[0] = self._ended()
         return [text for text in found if text]
 
@@ -107,20 +113,6 @@ class Watch:
             f"its steps are too large: KL {kl:.3f} is over desired_kl {target:g} with the learning rate on its floor of {least:g}; "
             "lower learning_rate_limits, or raise min_std"
         )
-
-
-@dataclass
-class _Check:
-    """A condition that must hold for some iterations."""
-
-    patience: int
-    check: Callable[[Mapping[str, Any]], str]
-    since: int | None = None
-
-    def after(self, record: Mapping[str, Any]) -> str:
-        text, iteration = self.check(record), record["iteration"]
-        self.since = None if not text else iteration if self.since is None else self.since
-        return text if self.since is not None and iteration - self.since >= self.patience else ""
 
 
 def _is_finite(value: Any) -> bool:
