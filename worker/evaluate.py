@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from shared_store.contract import plugins
@@ -123,9 +124,7 @@ def _rounds(task: Task, build: Callable[[int], Task], count: int, total: int, se
     """The worlds of each round: those of the global indices ``round * total`` and on, whatever the rounds before did to them."""
     from worker.learning.report import Failures
 
-    def say(line: str) -> None:
-        print(line, flush=True)
-
+    say = partial(print, flush=True)
     yield task
     for number in range(1, count):
         if task.config.randomize.draws_worlds:  # when they are built

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from worker.learning.cuda_graph import Readback
 from worker.learning.distributed import Gang
 from worker.learning.parts import Totals
 
@@ -29,7 +28,7 @@ class Exchange:
         sizes = {**of_ranks, "statistics": len(task.statistic_names), "signals": len(SIGNALS)}
         self._totals = Totals(sizes, gang.device)
         self._own = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
-        self._readback = Readback(gang.device)
+        self._pinned: torch.Tensor | None = None
 
     def gather(self, collected: float, signals: Mapping[str, float]) -> None:
         """Sum the rollout's statistics and each rank's signals over the ranks; clears the task's statistics.
@@ -50,14 +49,19 @@ class Exchange:
         self._gang.sum(totals.values)
 
     def read(self, metrics: Mapping[str, torch.Tensor]) -> tuple[dict[str, float], dict[str, list[float]]]:
-        """``metrics`` and the totals by name, on the host. Waits for the device.
+        """``metrics`` and the totals by name, on the host: the one place where an iteration waits for the device.
 
         Args:
             metrics: Each of shape (), on the device.
         """
         numbers = torch.cat([torch.stack([value.double() for value in metrics.values()]), self._totals.values])
-        known = self._readback.read(numbers)
-        return (
-            dict(zip(metrics, known, strict=False)),
-            Totals.named(self._totals.layout, known[len(metrics) :]),
-        )
+        if numbers.is_cuda:
+            if self._pinned is None:
+                self._pinned = torch.empty_like(numbers, device="cpu", pin_memory=True)
+            self._pinned.copy_(numbers, non_blocking=True)
+            arrived = torch.cuda.Event(blocking=True)  # let the waiting core sleep
+            arrived.record()
+            arrived.synchronize()
+            numbers = self._pinned
+        known = numbers.tolist()
+        return dict(zip(metrics, known, strict=False)), self._totals.named(known[len(metrics) :])

@@ -153,9 +153,9 @@ def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
     if not isinstance(algorithm := section.get("algorithm", ""), str):
         raise UserError(f"{kind}.algorithm: expected a text, found {kind_of(algorithm)}")
     places = {f"{kind}.{name}": section.get(name) for name in ("config", "settings", *sorted(training_sections()))}
-    for where, given in {**places, "checkpoint": spec.get("checkpoint")}.items():
-        if not isinstance(given, dict | None):
-            raise UserError(f"{where}: expected a mapping, found {kind_of(given)}")
+    for where, found in {**places, "checkpoint": spec.get("checkpoint")}.items():
+        if not isinstance(found, dict | None):
+            raise UserError(f"{where}: expected a mapping, found {kind_of(found)}")
 
 
 def with_texts(section: Mapping[str, Any], run: Run, kind: str) -> dict[str, Any]:

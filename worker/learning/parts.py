@@ -16,12 +16,11 @@ class Totals:
 
     >>> totals = Totals({"episodes": 1, "seconds": 3}, "cpu")
     >>> totals["seconds"][1] = 0.5
-    >>> Totals.named(totals.layout, totals.values.tolist())["seconds"]
+    >>> totals.named(totals.values.tolist())["seconds"]
     [0.0, 0.5, 0.0]
     """
 
     def __init__(self, sizes: Mapping[str, int], device: str) -> None:
-        self.layout = dict(sizes)
         self.values = torch.zeros(sum(sizes.values()), dtype=torch.float64, device=device)
         """All parts, one after the other, shape (n,)."""
         parts: Iterable[torch.Tensor] = self.values.split(list(sizes.values()))
@@ -31,11 +30,10 @@ class Totals:
         """A live view of one part, shape (its size,)."""
         return self._parts[name]
 
-    @staticmethod
-    def named(layout: Mapping[str, int], numbers: list[float]) -> dict[str, list[float]]:
-        """Numbers in the order of ``layout``, by name."""
+    def named(self, numbers: list[float]) -> dict[str, list[float]]:
+        """Numbers in the order of :attr:`values`, by the names of the parts."""
         rest = iter(numbers)
-        return {name: [next(rest) for _ in range(size)] for name, size in layout.items()}
+        return {name: [next(rest) for _ in range(len(part))] for name, part in self._parts.items()}
 
 
 def launch(kernel: wp.Kernel, dim: int | Sequence[int], arguments: Iterable[Any], device: str) -> None:

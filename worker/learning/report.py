@@ -194,7 +194,7 @@ class Report:
             for name, value in scalars(record).items():
                 self._events.add_scalar(name, value, record["iteration"])
         except OSError:
-            self._events = None  # the writer's thread has ended: another file is begun once the volume takes one
+            self._events = None  # the writer's thread has ended: the next record opens another file
             raise
 
     def _long(self, record: dict[str, float | int | None]) -> str:

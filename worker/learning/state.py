@@ -57,7 +57,7 @@ class EndedEpisodes(NamedTuple):
 
 
 class _Copies(NamedTuple):
-    """The state that was copied for a save that may be ordered after the next iteration has begun."""
+    """The state that was copied for a save that may be ordered after the next iteration began."""
 
     iteration: int = -1
     """Iterations done."""
@@ -174,7 +174,7 @@ class TrainingState:
             reporter: The checkpoint is committed after the calls that ``reporter`` has so far: a run that goes on from it has the
                 metrics records before it.
             wait: For earlier saves that are still being written, as long as they take.
-            scheduled: Whether the job asked for a checkpoint at this iteration.
+            scheduled: Whether a checkpoint is due at this iteration by the job's settings or by request.
 
         Raises:
             StaleEpoch: A newer attempt owns the run.

@@ -19,7 +19,7 @@ from tensordict import TensorDict
 
 from benchmarks import load, walking
 from benchmarks.peers import cases, conversion, table
-from benchmarks.peers.building import build_loop, limited
+from benchmarks.peers.building import build_loop
 from benchmarks.peers.inside.clock import Clock
 from benchmarks.processor import contradictions
 from benchmarks.stock import stock_runner
@@ -135,17 +135,6 @@ def test_a_policy_of_mjlab_fits_a_task_of_the_same_order_alone() -> None:
             conversion.check_contract(contract, own, "Own")
 
 
-def test_a_task_has_the_limits_of_its_case() -> None:
-    ours, theirs = (cases.find_case("ant").limits(whose) for whose in ("ours", "theirs"))
-    loose, settings = limited("Ant", vars(ours))
-    assert settings == {} and loose.solver_options["iterations"] == 3
-    exact, _ = limited("Ant", vars(theirs))
-    assert (exact.solver_options["iterations"], exact.solver_options["tolerance"]) == (100, 1e-6)
-    assert exact.solver_options["njmax"] == loose.solver_options["njmax"] and exact.__name__ == "Ant"
-    _, settings = limited("Go1Flat", vars(cases.find_case("go1").ours))
-    assert settings == {"solver_iterations": 4, "solver_line_search": 8}
-
-
 def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration(tmp_path: Path) -> None:
     shared = cases.find_case("ant").shared("muster", "ours")
     asked = {**shared, "worlds": 2, "iterations": 1, "save_every": 1, "seed": 0, "steps": 4, "hidden_sizes": [8]}
@@ -222,19 +211,6 @@ def test_a_machine_on_which_others_work_is_refused_or_marked(monkeypatch: pytest
     assert row["others"] > load.LIMIT
     assert load.told([row]).startswith("**The machine was loaded.** Other processes used at most ")
     assert "loaded" not in load.told([{"others": 0.01, "load_average": 0.2}])
-
-
-def test_processes_started_by_a_benchmark_do_not_count_as_load() -> None:
-    before = load.own_seconds()
-    child = subprocess.Popen(["sh", "-c", f"sh -c '{BUSY}' & wait"], start_new_session=True)
-    try:
-        deadline = time.monotonic() + 60
-        while load.own_seconds() < before + 0.3:  # while it runs, and its child's child
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-    finally:
-        os.killpg(child.pid, signal.SIGKILL)
-        child.wait()
 
 
 def test_a_training_that_took_longer_than_its_rate_says_is_a_contradiction() -> None:

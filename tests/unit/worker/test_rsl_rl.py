@@ -16,11 +16,10 @@ from rsl_rl.models import MLPModel
 from rsl_rl.runners import DistillationRunner, OnPolicyRunner
 from torch import nn
 
-from tests.support.worker.loop import alone, spaces_of
+from tests.support.worker.loop import spaces_of
 from tests.support.worker.onnx import onnx_of
 from tests.support.worker.rsl_loop import GRU, Seen, build, restore, save, settings, train
 from tests.support.worker.sac import same
-from worker.learning.algorithm import LearningSetting, Spaces, WorldShare
 from worker.learning.rsl.algorithm import RslRl
 from worker.learning.rsl.vector_environment import TaskVecEnv
 
@@ -159,12 +158,6 @@ def test_rsl_rl_s_refusal_is_reported_in_one_line_with_its_place(section: dict[s
         with pytest.raises(ValueError, match=rf"^rsl_rl\.{message}") as refusal:
             build(Seen(seed=3), {"num_steps_per_env": 8, **section})
     assert "\n" not in str(refusal.value)
-
-
-def test_choices_are_refused() -> None:
-    setting = LearningSetting(Spaces({"policy": (2,)}, 3, discrete=True), WorldShare(0, 8, 8), alone(), 1)
-    with pytest.raises(ValueError, match=r"^rsl_rl: .* actions of this task are choices$"):
-        RslRl(settings({}), setting)
 
 
 @pytest.mark.parametrize("name", CASES)
