@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
@@ -20,11 +18,7 @@ from tensordict import TensorDict
 from benchmarks import load, walking
 from benchmarks.peers import cases, conversion, table
 from benchmarks.peers.building import build_loop
-from benchmarks.peers.inside.clock import Clock
 from benchmarks.processor import contradictions
-from benchmarks.stock import stock_runner
-from worker.settings.ppo import PPOConfig
-from worker.tasks import find_task
 from worker.tasks.declare.interface import Action, Interface, Observation
 
 
@@ -165,34 +159,6 @@ def test_invalid_options_of_the_commands_are_refused(words: str, said: str, caps
     with pytest.raises(SystemExit) as ended:
         command.main(arguments)
     assert ended.value.code == 2 and said in capsys.readouterr().err
-
-
-def test_the_clock_notes_what_rsl_rls_runner_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rsl_rl.runners import OnPolicyRunner
-    from rsl_rl.utils.logger import Logger
-
-    for owner, name in ((OnPolicyRunner, "learn"), (Logger, "log")):
-        monkeypatch.setattr(owner, name, getattr(owner, name))  # put back afterwards
-    task = find_task("Cartpole")
-    own = task(task.config_type(episode_seconds=0.1), 4)
-    clock = Clock(time.time() - 5.0, 4, 8, lambda: None)
-    clock.install()
-    runner = stock_runner(own, PPOConfig(steps=8, minibatches=2), str(tmp_path), save_interval=2)
-    runner.learn(4)
-    clock.write(str(tmp_path / "found.json"), where=tmp_path)
-    found = json.loads((tmp_path / "found.json").read_text())
-    assert clock.runner is runner and found["where"] == str(tmp_path)
-    assert found["startup_s"] >= 5.0
-    assert [point["env_steps"] for point in found["curve"]] == [32, 64, 96, 128]
-    times = [point["seconds"] for point in found["curve"]]
-    assert times == sorted(times) and all(
-        point["collect_s"] + point["learn_s"] <= after - before
-        for point, before, after in zip(found["curve"], [0.0, *times], times, strict=False)
-    )
-    assert found["curve"][-1]["episode_length"] <= own.max_episode_length
-    saved = [(Path(each["path"]).name, each["iteration"]) for each in found["checkpoints"]]
-    assert saved == [("model_0.pt", 1), ("model_2.pt", 3), ("model_3.pt", 4)]
-    assert conversion.read_rsl_rl(found["checkpoints"][-1]["path"]).actions == own.action_size
 
 
 BUSY = "while :; do :; done"
