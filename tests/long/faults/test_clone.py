@@ -163,14 +163,14 @@ def begin(store: Path, task: Any = Point, **settings: Any) -> Loop:
         (
             "ppo",
             KINDS["own"],
-            r"fit this job: policy\.std is not there; they are of algorithm ppo, and worker\..*:PlainPPO does not",
+            r"fit this job: policy\.std is not there; they are of algorithm ppo, and tests\..*:PlainPPO does not",
         ),
         (
             "ppo",
             KINDS["rsl_rl"],
             "are of algorithm ppo, which rsl_rl can't read; set train.algorithm: ppo, or a module",
         ),
-        ("own", {}, r"fit this job: policy\.\S+ is not there; they are of algorithm worker\.\S+, and ppo "),
+        ("own", {}, r"fit this job: policy\.\S+ is not there; they are of algorithm tests\.\S+, and ppo "),
     ],
 )
 def test_weights_that_do_not_fit_are_refused_in_one_line(
