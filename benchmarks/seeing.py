@@ -32,8 +32,7 @@ from benchmarks.load import Watch, add_option, told
 from benchmarks.training import CUDA, build, device_name
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import read_metrics
-from worker.evaluation.blocks import SIZE, Blocks
-from worker.evaluation.episodes import play
+from worker.evaluation.episodes import SIZE, Blocks, play
 from worker.export import export
 from worker.learning.distributed import RankPlacement, connect
 from worker.learning.loop import Loop

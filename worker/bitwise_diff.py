@@ -24,8 +24,8 @@ from worker.learning.job import EX_ERROR, EX_USAGE, run_command
 from worker.learning.shards import Shards, read_file
 from worker.settings.errors import UserError
 
-_OF_THE_WRITING = {"created", "epoch", "files", "format", "seconds", "shards", "train", "world_size"}
-"""Keys of a manifest that say how and when it was written, not what was learnt (``train`` holds what was asked for)."""
+_CIRCUMSTANCES = {"created", "epoch", "files", "format", "seconds", "shards", "train", "world_size"}
+"""Keys of a manifest on how and when it was written, not on what was learnt (``train`` holds the job's settings)."""
 _BITS = {1: torch.uint8, 2: torch.int16, 4: torch.int32, 8: torch.int64}
 
 
@@ -39,8 +39,8 @@ def compare(first: Run, second: Run) -> str:
     if one.iteration != two.iteration:
         raise Difference(f"checkpoints: {one.name} of {first.name}, {two.name} of {second.name}: other iterations")
     tensors = _compare_files(one, two)
-    iterations = _compare_metrics(first, second, one.iteration)
-    return f"{counted(tensors, 'tensor')}, {counted(iterations, 'iteration')}"
+    _compare_metrics(first, second, one.iteration)
+    return f"{counted(tensors, 'tensor')}, {counted(one.iteration, 'iteration')}"
 
 
 def _newest(run: Run) -> Checkpoint:
@@ -67,23 +67,23 @@ def _compare_files(one: Checkpoint, two: Checkpoint) -> int:
         print(
             f"generators are not compared: {counted(ranks[0], 'rank')} saved them in one run, {ranks[1]} in the other"
         )
-    facts = [{k: v for k, v in each.manifest.items() if k not in _OF_THE_WRITING} for each in (one, two)]
+    facts = [{k: v for k, v in each.manifest.items() if k not in _CIRCUMSTANCES} for each in (one, two)]
     _compare_values("manifest.json", *facts)
     return tensors
 
 
 def _compare_values(file: str, one: Any, two: Any) -> int:
     """Compare two nested values bit by bit; returns how many tensors they hold. Raises Difference."""
-    flat = [dict(_flatten(value)) for value in (one, two)]
-    for key in flat[0].keys() ^ flat[1].keys():
+    first, second = (dict(_flatten(value)) for value in (one, two))
+    for key in first.keys() ^ second.keys():
         raise Difference(f"{file}: {key}: only one of the two has it")
-    for key, here in flat[0].items():
-        there = flat[1][key]
-        if isinstance(here, torch.Tensor) and isinstance(there, torch.Tensor):
-            _compare_tensors(f"{file}: {key}", here, there)
-        elif type(here) is not type(there) or repr(here) != repr(there):  # repr tells -0.0 from 0.0, and nan is nan
-            raise Difference(f"{file}: {key}: {here!r} and {there!r}")
-    return sum(isinstance(value, torch.Tensor) for value in flat[0].values())
+    for key, value in first.items():
+        other = second[key]
+        if isinstance(value, torch.Tensor) and isinstance(other, torch.Tensor):
+            _compare_tensors(f"{file}: {key}", value, other)
+        elif type(value) is not type(other) or repr(value) != repr(other):  # repr tells -0.0 from 0.0, and nan is nan
+            raise Difference(f"{file}: {key}: {value!r} and {other!r}")
+    return sum(isinstance(value, torch.Tensor) for value in first.values())
 
 
 def _flatten(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -110,16 +110,15 @@ def _compare_tensors(where: str, one: torch.Tensor, two: torch.Tensor) -> None:
         raise Difference(f"{where}: at {index}: {values} ({len(unequal)} of {one.numel()} elements differ)")
 
 
-def _compare_metrics(first: Run, second: Run, iterations: int) -> int:
-    """Compare the metrics of iterations 1 to ``iterations``; returns their number. Raises Difference."""
+def _compare_metrics(first: Run, second: Run, iterations: int) -> None:
+    """Compare the metrics of iterations 1 to ``iterations``. Raises Difference."""
     for run in (first, second):
-        there = [record["iteration"] for record in read_metrics(run)]
-        if there != list(range(1, iterations + 1)):
-            lacking = next((i for i in range(1, iterations + 1) if i not in there), there[-1] if there else 1)
-            raise Difference(f"metrics: run {run.name} has {len(there)} of {iterations} iterations (look at {lacking})")
-    for here, there_ in zip(read_metrics(first), read_metrics(second), strict=True):
-        _compare_values(f"metrics of iteration {here['iteration']}", _timeless(here), _timeless(there_))
-    return iterations
+        found = [record["iteration"] for record in read_metrics(run)]
+        if found != list(range(1, iterations + 1)):
+            lacking = next((i for i in range(1, iterations + 1) if i not in found), found[-1] if found else 1)
+            raise Difference(f"metrics: run {run.name} has {len(found)} of {iterations} iterations (look at {lacking})")
+    for one, two in zip(read_metrics(first), read_metrics(second), strict=True):
+        _compare_values(f"metrics of iteration {one['iteration']}", _timeless(one), _timeless(two))
 
 
 def _timeless(record: dict[str, Any]) -> dict[str, Any]:
@@ -132,12 +131,10 @@ def _timeless(record: dict[str, Any]) -> dict[str, Any]:
 
 def find_run(name: str) -> Run:
     """The run called ``name`` in ``$MUSTER_STORE``, or the one in directory ``name``. Raises UserError, StoreError."""
-    if os.sep in name:
-        run = Run(Path(name).absolute())
-    elif store := os.environ.get("MUSTER_STORE"):
-        run = Store(store).run(name)
-    else:
+    store = os.environ.get("MUSTER_STORE")
+    if os.sep not in name and not store:
         raise UserError(f"run {name}: set MUSTER_STORE to the store that has it, or give the run's directory")
+    run = Run(Path(name).absolute()) if os.sep in name else Store(store or "").run(name)
     if run.description() is None and not run.checkpoints.is_dir():
         raise UserError(f"run {name} does not exist: there is no {run.path}")
     return run

@@ -14,7 +14,6 @@ import hashlib
 import json
 import os
 import select
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from shared_store.volume.layout import Run
 GATHER_SECONDS = 120.0
 """Time that the main rank's writer waits for the files of the other ranks [s]."""
 _POLL = 0.02
-"""Seconds between two looks at what the main rank's writer waits for."""
+"""Seconds between two checks of what the main rank's writer waits for."""
 _CHUNK = 1 << 20
 
 
@@ -47,11 +46,11 @@ class Orders:
     def next(self) -> dict[str, Any] | None:
         """The next save; None at the end of the input. Waits."""
         while not self._waiting and not self.ended:
-            self.look(None)
+            self.read(None)
         return self._waiting.pop(0) if self._waiting else None
 
-    def look(self, seconds: float | None) -> None:
-        """Take in what has come, waiting up to ``seconds`` for it (None: until something comes)."""
+    def read(self, seconds: float | None) -> None:
+        """Read the input, after waiting up to ``seconds`` for some (None: until some comes)."""
         if self.ended or not select.select([0], [], [], seconds)[0]:
             return
         chunk = os.read(0, 65536)
@@ -83,20 +82,14 @@ def save(order: dict[str, Any], orders: Orders) -> dict[str, Any]:
             digests |= _gather(writer.path, rank, order["iteration"], orders)
         recorded = _wait_for_records(order, orders)
         checkpoint = writer.commit(order["facts"], order["keep"], digests)
-        return {
-            "committed": checkpoint.name,
-            "recorded": recorded,
-            "seconds": time.monotonic() - started,
-            "bytes": checkpoint.size,
-        }
+        seconds = time.monotonic() - started
+        return {"committed": checkpoint.name, "recorded": recorded, "seconds": seconds, "bytes": checkpoint.size}
     except StaleEpoch as error:
         return {"stale": str(error)}
     except OSError as error:
         _give_up(writer, order)
-        return {
-            "failed": f"{error.strerror or error}: {error.filename or run.checkpoints}",
-            "iteration": order["iteration"],
-        }
+        failed = f"{error.strerror or error}: {error.filename or run.checkpoints}"
+        return {"failed": failed, "iteration": order["iteration"]}
     except (Abandoned, ValueError) as error:  # ValueError: EPOCH is damaged
         _give_up(writer, order)
         return {"failed": str(error), "iteration": order["iteration"]}
@@ -134,7 +127,7 @@ def _gather(directory: Path, rank: int, iteration: int, orders: Orders) -> dict[
             raise Abandoned("another rank could not write its files")
         if time.monotonic() > deadline:
             raise Abandoned(f"the files of rank {rank} did not come within {GATHER_SECONDS:g} s")
-        orders.look(_POLL)
+        orders.read(_POLL)
     return read_json(directory / name) or {}
 
 
@@ -144,25 +137,14 @@ def _wait_for_records(order: dict[str, Any], orders: Orders) -> bool:
     if waited is None:
         return True
     deadline = time.monotonic() + waited["seconds"]
-    while read_iteration(waited["memory"]) < order["iteration"]:
+    while int.from_bytes(os.pread(waited["memory"], 8, 0), "little") < order["iteration"]:  # 0 before the first
         if orders.ended or time.monotonic() > deadline:
             return False
-        orders.look(_POLL)
+        orders.read(_POLL)
     return True
 
 
-def read_iteration(memory: int) -> int:
-    """The iteration in a memory file, up to which records are written; 0 before the first."""
-    return int.from_bytes(os.pread(memory, 8, 0), "little")
-
-
-def main() -> None:
-    """Serve orders until the input ends."""
-    orders = Orders()
-    while (order := orders.next()) is not None:
-        print(json.dumps(save(order, orders)), flush=True)
-    sys.exit(0)
-
-
 if __name__ == "__main__":
-    main()
+    received = Orders()
+    while (each := received.next()) is not None:
+        print(json.dumps(save(each, received)), flush=True)

@@ -6,6 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from shared_store.contract import plugins
@@ -35,16 +36,11 @@ def main(kind: str = "evaluate") -> int:
     job = Job.from_env(os.environ, kind)
     run, section, rules = job.named_run(), plugins.sections().get(kind), plugins.rules_of(kind)
     episodes = job.setting(*rules.count if rules else ("episodes", EPISODES))
-    from worker.learning.distributed import REPORT_SECONDS, RankPlacement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import connect_rank
 
-    use_cpu_threads(os.environ)
-    with user_errors():
-        placement = RankPlacement.from_env(os.environ)
-        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
-    gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
+    gang = connect_rank(os.environ)
     from shared_store.volume.evaluations import lines
-    from worker.evaluation.blocks import SIZE, Blocks
-    from worker.evaluation.episodes import Stopped, play
+    from worker.evaluation.episodes import SIZE, Blocks, Stopped, play
     from worker.evaluation.evaluation import result_of
     from worker.learning.algorithm import WorldShare
     from worker.learning.randomness import held_out_seed, seed_generators
@@ -84,13 +80,14 @@ def main(kind: str = "evaluate") -> int:
     started = time.perf_counter()
     rounds = _rounds(task, build, math.ceil(episodes / total), total, seed)
     watcher: Watcher | None = plugins.load(section.watcher)(task) if section else None
-    look = watcher.note if watcher else None
+    watch = watcher.note if watcher else None
     try:
-        played = play(rounds, policy, gang, episodes=episodes, is_asked_to_stop=lambda: stop.requested, look=look)
+        played = play(rounds, policy, gang, episodes=episodes, is_stop_requested=lambda: stop.requested, watch=watch)
     except Stopped:
         if gang.is_main:
             print(
-                "asked to stop: nothing was recorded; the evaluation begins anew when it is started again", flush=True
+                "stop requested: nothing was recorded; the evaluation begins anew when it is started again",
+                flush=True,
             )
         return EX_TEMPFAIL
     result = result_of(task, played, checkpoint.name, seed, started)
@@ -125,20 +122,18 @@ def _changes(rules: EvaluationRules, job: Job, kind: str, task_type: type[Task],
 
 def _rounds(task: Task, build: Callable[[int], Task], count: int, total: int, seed: int) -> Iterator[Task]:
     """The worlds of each round: those of the global indices ``round * total`` and on, whatever the rounds before did to them."""
-    from worker.learning.failures import Failures
+    from worker.learning.report import Failures
 
-    def say(line: str) -> None:
-        print(line, flush=True)
-
+    say = partial(print, flush=True)
     yield task
     for number in range(1, count):
         if task.config.randomize.draws_worlds:  # when they are built
-            Failures(task, say).tell()
+            Failures(task, say).report()
             task = build(number * total)
         else:
             task.restart(seed, task.first_world + total)
         yield task
-    Failures(task, say).tell()
+    Failures(task, say).report()
 
 
 def _circumstances(facts: Mapping[str, Any]) -> dict[str, Any]:

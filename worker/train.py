@@ -29,13 +29,9 @@ def main() -> int:
 
 
 def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
-    from worker.learning.distributed import REPORT_SECONDS, RankPlacement, connect, require_gpus, use_cpu_threads
+    from worker.learning.distributed import connect_rank
 
-    use_cpu_threads(os.environ)
-    with user_errors():
-        placement = RankPlacement.from_env(os.environ)
-        require_gpus(os.environ.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
-    gang = connect(placement, report_seconds=float(os.environ.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
+    gang = connect_rank(os.environ)
     if not isinstance(job.section.get("task"), str):
         raise UserError("train.task: the name of a task is missing")
     from worker.tasks import find_task
@@ -62,7 +58,7 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
 
 
 def hooks() -> list[Hook]:
-    """What watches a training, and what follows its end."""
+    """The hooks of every training: its tap, and its final evaluation."""
     from worker.evaluation.final_evaluation import FinalEvaluation
     from worker.telemetry.live_tap import LiveTap
 

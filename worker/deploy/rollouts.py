@@ -12,7 +12,8 @@ from tensordict import TensorDict
 
 from worker.deploy.parity import RecordedObservations
 from worker.evaluation import episodes
-from worker.evaluation.episodes import Acting, Episodes
+from worker.evaluation.episodes import Episodes
+from worker.learning.algorithm import Acting
 from worker.learning.distributed import Gang, RankPlacement
 from worker.learning.setup import observed
 from worker.settings.errors import TrainingError

@@ -1,36 +1,57 @@
-"""Whole episodes with the policy's mean action, from fresh resets, in the worlds of all ranks: one row for each."""
+"""Whole episodes with the policy's best action, from fresh resets, in the worlds of all ranks: one row for each."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import torch
 
+from worker.learning.algorithm import Acting, Policy
 from worker.learning.distributed import Gang
 from worker.learning.setup import observed
 
 if TYPE_CHECKING:
+    from tensordict import TensorDict
+
     from worker.tasks.run.task import Task
 
+SIZE = 32
+"""Worlds of a block."""
 _RETURN, _LENGTH, _TIME_OUT, _CAUSE, _SUCCESS, _TERMS = range(6)
-LOOK = 32
-"""Steps between two looks at whether any episode still runs: looking waits for the device and for the other ranks."""
-
-
-class Acting(Protocol):
-    """A policy, as far as it is evaluated: see :class:`worker.learning.algorithm.Policy`."""
-
-    def act(self, observations: Any) -> torch.Tensor:
-        """Mean actions, shape ``(worlds, actions)``, for the task's observation groups."""
-
-    def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """Forget what is remembered of the running episodes, of all worlds or where ``worlds`` is true."""
+_CHECKED = 32
+"""Steps between two checks whether any episode still runs: a check waits for the device and for the other ranks."""
 
 
 class Stopped(Exception):
-    """The gang was asked to leave; nothing was recorded."""
+    """The gang was requested to leave; nothing was recorded."""
+
+
+class Blocks:
+    """One policy for each block of worlds, together acting for all of them: it acts on a fixed number of worlds at a time.
+
+    The products of a network round otherwise for another number of rows. In blocks of one size, in which an episode always has the same
+    row, an action is a function of the observation and the row alone.
+
+    Args:
+        policies: Of each block, alike; they may remember their episodes. There are ``size`` worlds for each.
+        size: Worlds of a block.
+    """
+
+    def __init__(self, policies: Sequence[Policy], size: int = SIZE) -> None:
+        self._policies, self._size = policies, size
+
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """Best actions, shape ``(worlds, actions)``."""
+        parts: Any = observations.split(self._size)
+        return torch.cat([policy.act(part) for policy, part in zip(self._policies, parts, strict=True)])
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        """Forget the running episodes of all worlds, or where ``worlds`` is true."""
+        parts = [None] * len(self._policies) if worlds is None else worlds.split(self._size)
+        for policy, part in zip(self._policies, parts, strict=True):
+            policy.reset(part)
 
 
 @dataclass(frozen=True)
@@ -86,8 +107,8 @@ def play(
     gang: Gang,
     *,
     episodes: int | None = None,
-    is_asked_to_stop: Callable[[], bool] = lambda: False,
-    look: Callable[[torch.Tensor], None] | None = None,
+    is_stop_requested: Callable[[], bool] = lambda: False,
+    watch: Callable[[torch.Tensor], None] | None = None,
 ) -> Episodes:
     """One episode of every world in each round; all ranks call it.
 
@@ -96,18 +117,18 @@ def play(
 
     Args:
         rounds: The worlds of this rank, prepared for one round after the other.
-        policy: Takes the mean actions.
+        policy: Takes the best actions.
         gang: The ranks.
         episodes: How many are kept, the first ones; all by default.
-        is_asked_to_stop: Whether this rank was asked to leave; looked at now and then.
-        look: Called after each control step with the worlds whose episode had not ended before it, shape ``(worlds,)``, bool.
+        is_stop_requested: Whether this rank was requested to leave; checked now and then.
+        watch: Called after each control step with the worlds whose episode had not ended before it, shape ``(worlds,)``, bool.
 
     Raises:
-        Stopped: A rank was asked to leave.
+        Stopped: A rank was requested to leave.
     """
     parts, task = [], None
     for task in rounds:
-        parts.append(_gather(_one_round(task, policy, gang, is_asked_to_stop, look), gang))
+        parts.append(_gather(_one_round(task, policy, gang, is_stop_requested, watch), gang))
     assert task is not None
     ended = task.ended
     success = ended.meaning if ended and ended.says_success else None
@@ -120,8 +141,8 @@ def _one_round(
     task: Task,
     policy: Acting,
     gang: Gang,
-    is_asked_to_stop: Callable[[], bool],
-    look: Callable[[torch.Tensor], None] | None,
+    is_stop_requested: Callable[[], bool],
+    watch: Callable[[torch.Tensor], None] | None,
 ) -> torch.Tensor:
     """Rows of the first episode of each world after a reset, shape ``(worlds, columns)``."""
     task.reset()
@@ -133,16 +154,16 @@ def _one_round(
     for step in range(task.max_episode_length):
         task.step(policy.act(observations))
         policy.reset(task.dones)
-        if look is not None:
-            look(running)
+        if watch is not None:
+            watch(running)
         rows[:, _RETURN] += torch.where(running, task.rewards, 0.0)
         rows[:, _LENGTH] += running
-        over = running & (task.dones != 0)
-        rows[:, _TIME_OUT:] = torch.where(over[:, None], _end(task), rows[:, _TIME_OUT:])
-        running &= ~over
+        ended = running & (task.dones != 0)
+        rows[:, _TIME_OUT:] = torch.where(ended[:, None], _end(task), rows[:, _TIME_OUT:])
+        running &= ~ended
         # all ranks decide alike; where all episodes are short it saves most of the time
-        if step % LOOK == LOOK - 1:
-            state = gang.greatest(2 if is_asked_to_stop() else int(running.any()))
+        if step % _CHECKED == _CHECKED - 1:
+            state = gang.greatest(2 if is_stop_requested() else int(running.any()))
             if state == 2:
                 raise Stopped
             if state == 0:

@@ -1,7 +1,9 @@
-"""Deterministic evaluation: the mean action, whole episodes from a fresh reset, the worlds of all ranks; and what is kept of it."""
+"""Deterministic evaluation: the best action, whole episodes from a fresh reset, the worlds of all ranks; its summary and its table."""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
 import time
 from collections import Counter
@@ -21,12 +23,11 @@ from shared_store.volume.evaluations import (
     kind_of,
     list_evaluations,
 )
-from shared_store.volume.files import write_json
+from shared_store.volume.files import write_atomic, write_json
 from shared_store.volume.layout import Run
 from shared_store.volume.paired_episodes import are_paired, paired, read_returns
 from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.statistics import Sample, difference, share
-from worker.evaluation.table import write_table
 from worker.learning.algorithm import Policy
 from worker.learning.distributed import Gang
 from worker.learning.report import shown_of
@@ -40,29 +41,26 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class EvaluatedEpisodes:
-    """The episodes of all ranks, and what they are of.
-
-    Attributes:
-        checkpoint: Its name.
-        task: Name of the task.
-        episodes: What is known of each.
-        max_length: The longest that an episode can be [steps].
-        weights: Weight of each reward term.
-        seed: Of the worlds.
-        seconds: How long it took, by the clock [s].
-        shown: Unit of each metric that the task wants to be seen, such as ``{"metric_progress": "%"}``.
-        config: The task's whole configuration, as JSON.
-    """
+    """The episodes of all ranks, with their checkpoint and task."""
 
     checkpoint: str
+    """Its name."""
     task: str
+    """Name of the task."""
     played: Episodes
+    """The record of each episode."""
     max_length: int
+    """The longest that an episode can be [steps]."""
     weights: Mapping[str, float]
+    """Weight of each reward term."""
     seed: int | None
+    """Seed of the worlds; None: those of a training."""
     seconds: float
+    """Wall-clock duration [s]."""
     shown: Mapping[str, str]
+    """Unit of each metric that the task shows, such as ``{"metric_progress": "%"}``."""
     config: str
+    """The task's whole configuration, as JSON."""
 
     @property
     def episodes(self) -> int:
@@ -84,10 +82,14 @@ class EvaluatedEpisodes:
 
     def summary(self) -> dict[str, Any]:
         """Everything but the episodes themselves, as JSON values; lengths in steps, intervals of 95 %."""
-        played, count = self.played, self.episodes
-        returns = Sample.of(played.returns)
-        ends = Counter(played.ends)
-        successes = played.successes
+        played, count, successes = self.played, self.episodes, self.played.successes
+        returns, ends = Sample.of(played.returns), Counter(played.ends)
+
+        def described(prefix: str) -> dict[str, dict[str, Any]]:
+            terms = [term for term in played.terms if term.startswith(prefix)]
+            return {term.removeprefix(prefix): Sample.of(played.term(term)).describe() for term in terms}
+
+        rewards = described("reward_").items()
         return {
             "format": FORMAT,
             "checkpoint": self.checkpoint,
@@ -106,11 +108,8 @@ class EvaluatedEpisodes:
             "success": None if successes is None else share(int(successes.sum()), count),
             "success_is": played.success,
             "causes": {name: share(ends[name], count) for name in played.causes if ends[name]},
-            "rewards": {
-                name: {**self._described(f"reward_{name}"), "weight": self.weights.get(name)}
-                for name in self._named("reward_")
-            },
-            "metrics": {name: self._described(f"metric_{name}") for name in self._named("metric_")},
+            "rewards": {name: {**term, "weight": self.weights.get(name)} for name, term in rewards},
+            "metrics": described("metric_"),
             **shown_of({name: float(played.term(name).mean()) for name in self.shown}, self.shown),
             "seconds": self.seconds,
         }
@@ -122,28 +121,32 @@ class EvaluatedEpisodes:
 
         Args:
             run: The run that was evaluated.
-            job: Id of the job that did nothing else; it names the files.
-            judged: By the key of the job's section, what the episodes were by its rules; its files are written before the table.
-            **facts: What else the summary says.
+            job: Id of the evaluation's own job; it names the files.
+            judged: By the key of the job's section, the results by its rules; their files are written before the table.
+            **facts: Further entries of the summary.
         """
-        name = evaluation_name(self.checkpoint, job)
+        name, results = evaluation_name(self.checkpoint, job), judged or {}
         summary: dict[str, Any] = {
             **self.summary(),
             **facts,
             "job": job or None,
             "table": f"{name}.parquet",
             "time": time.time(),
+            **{key: each.summary() for key, each in results.items()},
         }
-        summary |= {key: each.summary() for key, each in (judged or {}).items()}
-        earlier = [each for each in list_evaluations(run) if each["name"] != name and each.get("task") == self.task]
         earlier = [
-            each for each in earlier if kind_of(each) == kind_of(summary) and _rewards(each) == _rewards(summary)
+            each
+            for each in list_evaluations(run)
+            if each["name"] != name and each.get("task") == self.task and kind_of(each) == kind_of(summary)
         ]
-        if earlier:
-            summary["compared"] = self._compared(run, _partner(earlier, summary), summary)
+        if earlier := [each for each in earlier if _rewards(each) == _rewards(summary)]:
+            # the newest of another checkpoint in the same episodes, else the newest of all
+            other = [each for each in earlier if each["checkpoint"] != summary["checkpoint"]]
+            partner = ([each for each in other if are_paired(summary, each)] or earlier)[-1]
+            summary["compared"] = self._compared(run, partner, summary)
         summary = _finite(summary)
         further: dict[str, list[Any]] = {}
-        for each in (judged or {}).values():
+        for each in results.values():
             each.write(run.evaluations / name)
             further |= each.columns()
         known = {"run": run.name, "checkpoint": self.checkpoint, "task": self.task, "config": self.config}
@@ -151,35 +154,25 @@ class EvaluatedEpisodes:
         write_json(run.evaluations / f"{name}.json", summary)
         return summary
 
-    def _named(self, prefix: str) -> list[str]:
-        return [name.removeprefix(prefix) for name in self.played.terms if name.startswith(prefix)]
-
-    def _described(self, term: str) -> dict[str, float | None]:
-        return Sample.of(self.played.term(term)).describe()
-
     def _compared(self, run: Run, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any]:
         """The differences to an earlier evaluation of the run: episode by episode where both played the same ones."""
-        std = old.get("std_return")
-        before = Sample(int(old["episodes"]), float(old["mean_return"]), float(std or 0.0))
+        before = Sample(int(old["episodes"]), float(old["mean_return"]), float(old.get("std_return") or 0.0))
+        found = None
+        if are_paired(new, old):
+            with contextlib.suppress(OSError, ValueError):  # its table is gone, or damaged
+                table = run.evaluations / f"{old['name']}.parquet"
+                found = paired(self.played.returns.tolist(), read_returns(table))
         return {
             "name": old["name"],
             "checkpoint": checkpoint_of(old["name"]),
             "time": old["time"],
             "other_worlds": (old.get("config") or {}) != (new.get("config") or {}),
-            "return": self._pairs(run, old, new) or difference(Sample.of(self.played.returns), before),
+            "return": found or difference(Sample.of(self.played.returns), before),
         }
-
-    def _pairs(self, run: Run, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[str, Any] | None:
-        if not are_paired(new, old):
-            return None
-        try:
-            return paired(self.played.returns.tolist(), read_returns(run.evaluations / f"{old['name']}.parquet"))
-        except (OSError, ValueError):  # its table is gone, or damaged
-            return None
 
 
 class Judged(Protocol):
-    """What the episodes of a job were by the rules of its section."""
+    """The results of a job's episodes by the rules of its section."""
 
     def summary(self) -> dict[str, Any]:
         """As JSON values, for the evaluation's summary."""
@@ -192,7 +185,7 @@ class Judged(Protocol):
 
 
 class Watcher(Protocol):
-    """Looks on while the episodes of a job are played whose section has rules of its own, one in each world.
+    """Watches the episodes of a job whose section has its own rules, one in each world.
 
     ``task``: at the start of the episodes.
     """
@@ -203,10 +196,10 @@ class Watcher(Protocol):
         """Called after each control step with the worlds whose episode had not ended before it, shape ``(worlds,)``, bool."""
 
     def result(self, played: Episodes, section: Mapping[str, Any], seed: int, facts: Mapping[str, Any]) -> Judged:
-        """What the episodes were.
+        """The results.
 
         Args:
-            played: How each ended.
+            played: The record of each.
             section: Of the job.
             seed: Of the worlds.
             facts: The checkpoint's manifest.
@@ -227,7 +220,7 @@ def evaluate(
 
 
 def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, started: float) -> EvaluatedEpisodes:
-    """The evaluation that these episodes make; ``started`` by ``time.perf_counter``."""
+    """The evaluation of these episodes; ``started`` by ``time.perf_counter``."""
     return EvaluatedEpisodes(
         checkpoint=checkpoint,
         task=type(task).__name__,
@@ -241,8 +234,8 @@ def result_of(task: Task, played: Episodes, checkpoint: str, seed: int | None, s
     )
 
 
-def best_words(run: Run) -> str:
-    """Which checkpoint is the best by evaluations, as it is told at the end of a training; nothing where there is none to compare it with."""
+def best_line(run: Run) -> str:
+    """A line on the checkpoint that is the best by evaluations, for the end of a training; empty where none can be compared."""
     try:
         evaluated, checkpoints = by_checkpoint(run), list_checkpoints(run)
     except OSError:
@@ -256,14 +249,53 @@ def best_words(run: Run) -> str:
     )
 
 
-def _partner(earlier: Sequence[dict[str, Any]], new: Mapping[str, Any]) -> dict[str, Any]:
-    """The evaluation to compare with: the newest of another checkpoint in the same episodes, else the newest of all."""
-    paired = [each for each in earlier if are_paired(new, each) and each["checkpoint"] != new["checkpoint"]]
-    return (paired or earlier)[-1]
+def write_table(
+    path: Path,
+    played: Episodes,
+    seed: int | None,
+    facts: Mapping[str, str],
+    further: Mapping[str, Sequence[Any]] | None = None,
+) -> None:
+    """Write the episodes, whole or not at all. The same episodes are the same bytes. Raises OSError.
+
+    Columns: ``episode`` (its number), ``seed`` (of the worlds; none of those of a training), ``return``, ``length`` [steps], ``success``,
+    ``cause``, and of each term ``reward_NAME`` (weighted sum) or ``metric_NAME`` (mean over the steps, or the last value).
+
+    Args:
+        path: Of the file.
+        played: The episodes.
+        seed: Of the worlds.
+        facts: What was evaluated, for the key-value metadata of the file: ``run``, ``checkpoint``, ``task``, ``config`` (JSON).
+        further: Columns of further facts, by name; numbers are float64 unless all are whole.
+    """
+    import pyarrow as arrow
+    import pyarrow.parquet
+
+    count = len(played.rows)
+    successes = played.successes
+    columns = {
+        "episode": arrow.array(range(count), arrow.int64()),
+        "seed": arrow.array([seed] * count, arrow.int64()),
+        # of float32 sums: no digit of them is lost
+        "return": arrow.array(played.returns.numpy(), arrow.float64()),
+        "length": arrow.array(played.lengths.long().numpy(), arrow.int64()),
+        "success": arrow.array([None] * count if successes is None else successes.tolist(), arrow.bool_()),
+        "cause": arrow.array(played.ends, arrow.string()),
+        **{name: arrow.array(played.term(name).numpy(), arrow.float64()) for name in played.terms},
+    }
+    for name, values in (further or {}).items():
+        whole = all(isinstance(value, int) for value in values)
+        text = all(isinstance(value, str) for value in values)
+        columns[name] = arrow.array(values, arrow.string() if text else arrow.int64() if whole else arrow.float64())
+    buffer = io.BytesIO()
+    pyarrow.parquet.write_table(arrow.table(columns).replace_schema_metadata(dict(facts)), buffer)
+    for left in path.parent.glob(f".{path.name}.*.tmp"):  # of an evaluation that was killed
+        left.unlink(missing_ok=True)
+    write_atomic(path, buffer.getvalue())
 
 
 def _rewards(summary: Mapping[str, Any]) -> list[Any]:
-    """What an evaluation rewarded: returns of other rewards can't be compared."""
+    """The rewards of an evaluation: returns of other rewards can't be compared."""
     terms, changes = summary.get("rewards") or {}, summary.get("config") or {}
     own = {key: value for key, value in changes.items() if key.startswith("reward")}
     return [{name: term.get("weight") for name, term in terms.items()}, own]

@@ -94,8 +94,8 @@ class Transition:
     """Whether it ended by the clock alone; shape (worlds,), bool."""
 
 
-class Policy(Protocol):
-    """The learnt policy, without the training state, for evaluation and export. It draws no random numbers."""
+class Acting(Protocol):
+    """A policy, as far as it is evaluated. It draws no random numbers."""
 
     def act(self, observations: TensorDict) -> torch.Tensor:
         """The policy's best action for each world.
@@ -109,6 +109,10 @@ class Policy(Protocol):
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
         """Clear the recurrent state, if any, of all worlds or where ``worlds`` (n,) is true."""
+
+
+class Policy(Acting, Protocol):
+    """The learnt policy, without the training state, for evaluation and export."""
 
     def module(self) -> ExportedPolicy:
         """The same policy as a module for the export to ONNX, on the CPU."""

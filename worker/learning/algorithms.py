@@ -25,6 +25,10 @@ from worker.settings.task import TaskConfig
 
 DEFAULT = "ppo"
 _GROUP = "muster.algorithms"
+_REPLACED = {
+    "worker.learning.plain_ppo:PlainPPO": "algorithm ppo computes the same: set train.algorithm: ppo, with these settings under ppo"
+}
+"""Classes of earlier versions, and what replaces them."""
 
 
 def installed() -> dict[str, str]:
@@ -49,13 +53,15 @@ def find_algorithm(name: str) -> type[Algorithm]:
     """
     if words := clash(entry_points(group=_GROUP), name):
         raise UserError(f"train.algorithm: {words}")
+    if name in _REPLACED:
+        raise UserError(f"train.algorithm: {name} is no longer part of Muster; {_REPLACED[name]}")
     known = installed()
     place = name if ":" in name else known.get(name, "")
     module, _, attribute = place.partition(":")
     if not re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*", place):
-        there = ", ".join(sorted(known)) or "none, since no package is installed here that names any"
+        names = ", ".join(sorted(known)) or "none, since no package is installed here that names any"
         raise UserError(
-            f"train.algorithm: no algorithm is called {shown(name)}; known: {there}, and module:Class of your own"
+            f"train.algorithm: no algorithm is called {shown(name)}; known: {names}, and module:Class of your own"
         )
     if place == name and os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())  # as for a user's own task (worker.tasks)
@@ -81,38 +87,37 @@ def refuse_incomplete(found: object, name: str, parts: Sequence[str]) -> None:
 def check_state(algorithm: Algorithm, name: str) -> None:
     """Raises UserError if the state of an algorithm lacks the policy, which evaluation and export read."""
     if not isinstance(algorithm.state_dict().get("policy"), Mapping):
-        raise UserError(f'train.algorithm: {name}: state_dict() must hold "policy", the state_dict() of its policy')
+        raise _mistake(name, 'state_dict() must hold "policy", the state_dict() of its policy')
 
 
 def check_actions(actions: Any, expected: torch.Size, name: str) -> None:
     """Raises UserError for actions other than a tensor of the ``expected`` shape."""
     if not isinstance(actions, torch.Tensor) or actions.shape != expected:
-        found = tuple(actions.shape) if isinstance(actions, torch.Tensor) else type(actions).__name__
-        raise UserError(
-            f"train.algorithm: {name}: act() must give a tensor of shape {tuple(expected)} (worlds, actions); it gave {found}"
-        )
+        shape = f"a tensor of shape {tuple(expected)} (worlds, actions)"
+        raise _mistake(name, f"act() must give {shape}; it gave {_shape_of(actions)}")
 
 
 def check_metrics(metrics: Any, name: str) -> None:
     """Raises UserError for metrics that are not scalar tensors by name."""
     if not isinstance(metrics, Mapping):
-        raise UserError(
-            f"train.algorithm: {name}: learn() must give a mapping of metrics, not a {type(metrics).__name__}"
-        )
+        raise _mistake(name, f"learn() must give a mapping of metrics, not a {type(metrics).__name__}")
     for key, value in metrics.items():
         if not isinstance(value, torch.Tensor) or value.shape != ():
-            found = tuple(value.shape) if isinstance(value, torch.Tensor) else type(value).__name__
-            raise UserError(
-                f"train.algorithm: {name}: learn() must give tensors of shape (); its metric {key} is {found}"
-            )
+            raise _mistake(name, f"learn() must give tensors of shape (); its metric {key} is {_shape_of(value)}")
 
 
 def check_names(metrics: Collection[str], record: Collection[str], name: str) -> None:
     """Raises UserError for a metric with the name of a number that every record has."""
     if taken := sorted(set(metrics) & set(record)):
-        raise UserError(
-            f"train.algorithm: {name}: a metric of learn() can't be called {taken[0]}: every record has one"
-        )
+        raise _mistake(name, f"a metric of learn() can't be called {taken[0]}: every record has one")
+
+
+def _mistake(name: str, problem: str) -> UserError:
+    return UserError(f"train.algorithm: {name}: {problem}")
+
+
+def _shape_of(value: Any) -> str:
+    return str(tuple(value.shape)) if isinstance(value, torch.Tensor) else type(value).__name__
 
 
 def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section: Mapping[str, Any]) -> Any:
@@ -122,18 +127,19 @@ def settings(algorithm: type[Algorithm], name: str, config: TaskConfig, section:
         section: The job's ``train``: settings stand under the algorithm's name, those of a user's own under ``settings``.
     """
     where = section_of(name)
-    given = section.get(where) or {}
+    changes = section.get(where) or {}
     own = getattr(config, name, None)
     base = {item.name: getattr(own, item.name) for item in dataclasses.fields(own) if item.init} if own else {}
     kind: Any = algorithm.config_type
     if not dataclasses.is_dataclass(algorithm.config_type):
         raise UserError(f"train.algorithm: {name}: its config_type must be a dataclass, not {kind.__name__}")
     known = [item.name for item in dataclasses.fields(kind)]
-    for key in given:
+    for key in changes:
         if key not in known:
-            raise UserError(f"train.{where}.{key}: {unknown(key, known, getattr(kind, 'elsewhere', {}))}")
+            hint = getattr(kind, "elsewhere", {}).get(key) or nearest(key, sorted(known))
+            raise UserError(f"train.{where}.{key}: there is no such setting; {hint}")
     try:
-        return kind(**{**base, **given})
+        return kind(**{**base, **changes})
     except (TypeError, ValueError) as error:
         raise UserError(refusal(where, error)) from error
 
@@ -146,10 +152,3 @@ def refusal(where: str, error: TypeError | ValueError) -> str:
     if isinstance(first.get("input"), ArgsKwargs):  # the message of a rule over several fields is complete
         first["input"] = {}
     return f"{'.'.join(map(str, ('train', where, *path_of(first))))}: {explain(first)}"[:1000]
-
-
-def unknown(key: str, known: list[str], elsewhere: Mapping[str, str]) -> str:
-    """The error for a setting that an algorithm does not have."""
-    if key in elsewhere:
-        return f"there is no such setting; {elsewhere[key]}"
-    return f"there is no such setting; {nearest(key, sorted(known))}"

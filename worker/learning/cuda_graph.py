@@ -68,23 +68,3 @@ class CudaGraphFunction:
             self._function()
         self.seconds = time.perf_counter() - started
         return graph
-
-
-class Readback:
-    """Brings a few numbers to the host: the one place where an iteration waits for the device."""
-
-    def __init__(self, device: str) -> None:
-        self._cuda = device.startswith("cuda")
-        self._pinned: torch.Tensor | None = None
-
-    def read(self, numbers: torch.Tensor) -> list[float]:
-        """The values of ``numbers``, shape (n,), once the device has computed them."""
-        if not self._cuda:
-            return numbers.tolist()
-        if self._pinned is None:
-            self._pinned = torch.empty_like(numbers, device="cpu", pin_memory=True)
-        self._pinned.copy_(numbers, non_blocking=True)
-        arrived = torch.cuda.Event(blocking=True)  # let the waiting core sleep
-        arrived.record()
-        arrived.synchronize()
-        return self._pinned.tolist()

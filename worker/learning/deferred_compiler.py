@@ -1,4 +1,4 @@
-"""Starting without torch's compiler, which nothing here uses and whose import takes as long as half of all other imports together.
+"""Starting without torch's compiler: nothing here uses it, and its import takes as long as half of all other imports together.
 
 ``import tensordict`` and the first step of any optimizer import ``torch._dynamo`` only to tell it which functions it need not look
 at. Until somebody really wants it (``torch.compile``, an export), a stand-in takes these notes down.
@@ -17,7 +17,7 @@ _NAME = "torch._dynamo"
 
 
 class _Deferred(types.ModuleType):
-    """``torch._dynamo`` as far as eager code needs it; anything else loads the real one, which is told what was noted."""
+    """``torch._dynamo`` as far as eager code needs it; anything else loads the real one and passes these notes on."""
 
     def __init__(self) -> None:
         super().__init__(_NAME)
@@ -52,6 +52,6 @@ class _Deferred(types.ModuleType):
 
 
 def defer_compiler() -> None:
-    """Leave ``torch._dynamo`` out until it is needed; nothing where it is there already."""
+    """Leave ``torch._dynamo`` out until it is needed, unless it is imported already."""
     if _NAME not in sys.modules:
         sys.modules[_NAME] = torch._dynamo = _Deferred()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import hashlib
+import inspect
 import os
 import socket
 import time
@@ -23,7 +24,7 @@ import torch
 import torch.distributed as dist
 
 from worker.learning.deferred_compiler import defer_compiler
-from worker.settings.errors import GangError
+from worker.settings.errors import GangError, UserError
 
 REPORT_SECONDS = 60.0
 """Longest time between the first and the last report of a gang's ranks [s]."""
@@ -120,7 +121,7 @@ class Gang:
         if self.store is None:
             return text
         self._messages += 1
-        key = f"told/{self._messages}"
+        key = f"message/{self._messages}"
         if self.is_main:
             self.store.set(key, "-" if text is None else f"+{text}")
             return text
@@ -170,6 +171,17 @@ def _needs_main_rank() -> Iterator[None]:
         yield
     except dist.DistError as error:
         raise GangError("the main rank ended or did not answer in time; its log gives the reason") from error
+
+
+def connect_rank(env: Mapping[str, str]) -> Gang:
+    """:func:`connect` this rank, placed by the variables in ``env``. Raises UserError for a malformed one, and for a GPU that can't be used."""
+    use_cpu_threads(env)
+    try:
+        placement = RankPlacement.from_env(env)
+        require_gpus(env.get("CUDA_VISIBLE_DEVICES", ""), placement.local_rank)
+    except ValueError as error:
+        raise UserError(str(error)) from error
+    return connect(placement, report_seconds=float(env.get("MUSTER_REPORT_SECONDS") or REPORT_SECONDS))
 
 
 def require_gpus(visible: str, local_rank: int) -> None:
@@ -247,8 +259,7 @@ def _open_store(placement: RankPlacement, seconds: float) -> dist.TCPStore:
 
 
 def _listen(address: str, port: int) -> int:
-    family = socket.AF_INET6 if ":" in address else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener = socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         try:
@@ -267,15 +278,11 @@ def _listen(address: str, port: int) -> int:
 
 
 def _report(placement: RankPlacement, store: dist.Store, seconds: float) -> list[str]:
-    """Every rank says that it is there; returns each rank's (host, kernel cache)."""
+    """Every rank reports; returns each rank's (host, kernel cache)."""
     site = f"{socket.gethostname()}:{os.environ.get('WARP_CACHE_PATH', '')}"
     store.set(f"here/{placement.rank}", site)
     if placement.rank == 0:
-        missing = _await_reports(placement.world_size, store, seconds)
-        verdict = _missing(placement, missing, seconds) if missing else ""
-        store.set("verdict", verdict)
-        if missing:
-            _let_them_read(store, placement.world_size - len(missing) - 1)
+        verdict = _await_reports(placement, store, seconds)
     else:
         try:
             store.wait(["verdict"], timedelta(seconds=seconds + 10))
@@ -289,37 +296,32 @@ def _report(placement: RankPlacement, store: dist.Store, seconds: float) -> list
     return [store.get(f"here/{rank}").decode() for rank in range(placement.world_size)]
 
 
-def _await_reports(count: int, store: dist.Store, seconds: float) -> list[int]:
+def _await_reports(placement: RankPlacement, store: dist.Store, seconds: float) -> str:
+    """Wait for the reports, on the main rank; returns the error if some are missing, once the others had time to read it."""
     deadline = time.monotonic() + seconds
-    missing = list(range(count))
-    while missing:
-        missing = [rank for rank in missing if not store.check([f"here/{rank}"])]
-        if missing and time.monotonic() > deadline:
+    missing = list(range(placement.world_size))
+    while missing := [rank for rank in missing if not store.check([f"here/{rank}"])]:
+        if time.monotonic() > deadline:
             break
         time.sleep(0.02)
-    return missing
-
-
-def _missing(placement: RankPlacement, missing: list[int], seconds: float) -> str:
-    names = ", ".join(placement.describe(rank) for rank in missing)
-    return (
-        f"{names} did not report within {seconds:g} s: {placement.world_size - len(missing)} of {placement.world_size} ranks are here. "
+    names, present = ", ".join(map(placement.describe, missing)), placement.world_size - len(missing)
+    verdict = missing and (
+        f"{names} did not report within {seconds:g} s: {present} of {placement.world_size} ranks are here. "
         f"Look at the log of that node; it must reach {placement.master_address}:{placement.master_port}"
     )
-
-
-def _let_them_read(store: dist.Store, readers: int) -> None:
-    """The store ends with this process: give the others a moment to read why."""
+    store.set("verdict", verdict or "")
     deadline = time.monotonic() + 3.0
-    while store.add("read", 0) < readers and time.monotonic() < deadline:
+    # the store ends with this process: give the others a moment
+    while missing and store.add("read", 0) < present - 1 and time.monotonic() < deadline:
         time.sleep(0.02)
+    return verdict or ""
 
 
 def use_cpu_threads(env: Mapping[str, str]) -> None:
     """Give torch ``OMP_NUM_THREADS`` threads; without it, this rank's share of the host."""
-    given = env.get("OMP_NUM_THREADS", "")
+    threads = env.get("OMP_NUM_THREADS", "")
     share = len(os.sched_getaffinity(0)) // max(1, int(env.get("LOCAL_WORLD_SIZE", "1")))
-    torch.set_num_threads(int(given) if given.isdecimal() and int(given) > 0 else max(1, share))
+    torch.set_num_threads(int(threads) if threads.isdecimal() and int(threads) > 0 else max(1, share))
 
 
 def warm_marker(task: type, device: str) -> Path | None:
@@ -338,11 +340,11 @@ def warm_marker(task: type, device: str) -> Path | None:
         with contextlib.suppress(metadata.PackageNotFoundError):
             parts.append(metadata.version(package))
     with contextlib.suppress(TypeError, OSError):
-        import inspect
-
         # its kernels may lie in the modules of its bases
         parts.extend(Path(inspect.getfile(each)).read_text() for each in task.__mro__ if each is not object)
-    version = metadata.version(
-        "warp-lang"
-    )  # below it Warp keeps its own; a folder of this name beside it would make it warn
-    return Path(cache) / version / f"wp_muster_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
+    # below Warp's version, where it keeps its own: a folder of this name beside it would make it warn
+    return (
+        Path(cache)
+        / metadata.version("warp-lang")
+        / f"wp_muster_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
+    )

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from worker.learning.cuda_graph import Readback
 from worker.learning.distributed import Gang
-from worker.learning.totals import Totals
+from worker.learning.parts import Totals
 
 if TYPE_CHECKING:
     from worker.tasks.run.task import Task
@@ -24,18 +23,12 @@ class Exchange:
 
     def __init__(self, gang: Gang, task: Task) -> None:
         self._gang, self._task = gang, task
-        signals = dict.fromkeys(SIGNALS, 1)
-        self._totals = Totals(
-            {
-                "collected": gang.size,  # [s], of each rank in the iteration before
-                "mishap": gang.size,  # of each rank, see Task.read_mishap
-                "statistics": len(task.statistic_names),
-                **signals,
-            },
-            gang.device,
-        )
-        self._own = Totals({"collected": 1, **signals}, "cpu", pinned=gang.device != "cpu")
-        self._readback = Readback(gang.device)
+        # of each rank: the seconds of its previous rollout, and its mishap (see Task.read_mishap)
+        of_ranks = {"collected": gang.size, "mishap": gang.size}
+        sizes = {**of_ranks, "statistics": len(task.statistic_names), "signals": len(SIGNALS)}
+        self._totals = Totals(sizes, gang.device)
+        self._own = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
+        self._pinned: torch.Tensor | None = None
 
     def gather(self, collected: float, signals: Mapping[str, float]) -> None:
         """Sum the rollout's statistics and each rank's signals over the ranks; clears the task's statistics.
@@ -44,28 +37,31 @@ class Exchange:
             collected: Duration of this rank's previous rollout [s].
             signals: This rank's :data:`SIGNALS`.
         """
-        totals, own, rank = self._totals, self._own, self._gang.rank
+        totals, rank = self._totals, self._gang.rank
         totals.values.zero_()
         totals["mishap"][rank].copy_(self._task.mishap[0])
         totals["statistics"].copy_(self._task.statistics)
         self._task.clear_statistics()
         # the device has copied the previous iteration's values: read() waited for it
-        own["collected"].fill_(collected)
-        totals["collected"][rank : rank + 1].copy_(own["collected"], non_blocking=True)
-        for name in SIGNALS:
-            own[name].fill_(signals[name])
-            totals[name].copy_(own[name], non_blocking=True)
+        self._own.copy_(torch.tensor([collected, *(float(signals[name]) for name in SIGNALS)], dtype=torch.float64))
+        totals["collected"][rank : rank + 1].copy_(self._own[:1], non_blocking=True)
+        totals["signals"].copy_(self._own[1:], non_blocking=True)
         self._gang.sum(totals.values)
 
     def read(self, metrics: Mapping[str, torch.Tensor]) -> tuple[dict[str, float], dict[str, list[float]]]:
-        """``metrics`` and the totals by name, on the host. Waits for the device.
+        """``metrics`` and the totals by name, on the host: the one place where an iteration waits for the device.
 
         Args:
             metrics: Each of shape (), on the device.
         """
         numbers = torch.cat([torch.stack([value.double() for value in metrics.values()]), self._totals.values])
-        known = self._readback.read(numbers)
-        return (
-            dict(zip(metrics, known, strict=False)),
-            Totals.named(self._totals.layout, known[len(metrics) :]),
-        )
+        if numbers.is_cuda:
+            if self._pinned is None:
+                self._pinned = torch.empty_like(numbers, device="cpu", pin_memory=True)
+            self._pinned.copy_(numbers, non_blocking=True)
+            arrived = torch.cuda.Event(blocking=True)  # let the waiting core sleep
+            arrived.record()
+            arrived.synchronize()
+            numbers = self._pinned
+        known = numbers.tolist()
+        return dict(zip(metrics, known, strict=False)), self._totals.named(known[len(metrics) :])

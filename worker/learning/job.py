@@ -153,9 +153,9 @@ def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
     if not isinstance(algorithm := section.get("algorithm", ""), str):
         raise UserError(f"{kind}.algorithm: expected a text, found {kind_of(algorithm)}")
     places = {f"{kind}.{name}": section.get(name) for name in ("config", "settings", *sorted(training_sections()))}
-    for where, given in {**places, "checkpoint": spec.get("checkpoint")}.items():
-        if not isinstance(given, dict | None):
-            raise UserError(f"{where}: expected a mapping, found {kind_of(given)}")
+    for where, found in {**places, "checkpoint": spec.get("checkpoint")}.items():
+        if not isinstance(found, dict | None):
+            raise UserError(f"{where}: expected a mapping, found {kind_of(found)}")
 
 
 def with_texts(section: Mapping[str, Any], run: Run, kind: str) -> dict[str, Any]:
@@ -201,7 +201,7 @@ def user_errors(where: str | None = None) -> Iterator[None]:
 
 
 def run_command(body: Callable[[], int]) -> None:
-    """Run a command and exit with its code: 2 for a user's error, 1 for any other, both told to the supervisor."""
+    """Run a command and exit with its code: 2 for a user's error, 1 for any other, both reported to the supervisor."""
     # Importing the simulation parses hundreds of kernels; garbage collection would make that 50 % slower.
     gc.disable()
     try:

@@ -11,45 +11,36 @@ from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.node_outcomes import EX_TEMPFAIL
-from worker.learning.adoption import adopt
-from worker.learning.algorithm import Algorithm, WorldShare
+from worker.learning.algorithm import WorldShare
 from worker.learning.algorithms import check_actions, check_metrics, check_names, check_state
-from worker.learning.beacon import Beacon
-from worker.learning.cadence import Cadence
-from worker.learning.completion import complete
 from worker.learning.cuda_graph import CudaGraphFunction
 from worker.learning.distributed import Gang
-from worker.learning.earlier_settings import as_begun
 from worker.learning.exchange import SIGNALS, Exchange
-from worker.learning.failures import Failures
-from worker.learning.fault_injection import die, kill_at
-from worker.learning.hooks import Hook
+from worker.learning.hooks import FaultInjection, Hook
 from worker.learning.incident import Incident
+from worker.learning.initial_weights import adopt, load_teacher
 from worker.learning.job import StopRequest, end_startup, user_errors
-from worker.learning.leaving import patience_of
+from worker.learning.leaving import complete, patience_of
 from worker.learning.randomness import seed_generators
-from worker.learning.report import Report, Stopwatch, figures_of, shown_of, straggler
-from worker.learning.reporter import Fence, Gate, Reporter
+from worker.learning.report import Failures, Reporting, Stopwatch, figures_of, shown_of, straggler
+from worker.learning.reporter import Beacon, Fence, Gate, Reporter
+from worker.learning.saving import Cadence
 from worker.learning.setup import (
     build_algorithm,
     build_task,
     describe,
     described_policy,
-    observed,
     total_worlds,
     transition,
     write_contract,
 )
-from worker.learning.state import TrainingState
-from worker.learning.teacher import give_teacher
-from worker.learning.training import Training
+from worker.learning.state import EndedEpisodes, TrainingState
+from worker.learning.training import Training, as_begun
 from worker.settings.errors import TrainingError, UserError
 from worker.settings.task import value_at
 
 if TYPE_CHECKING:
     from worker.tasks.run.step_log import StepLog
-    from worker.tasks.run.task import Task
-
 
 WARNINGS = 10
 """Resets of worlds are logged for at most this many iterations; later ones are only counted."""
@@ -65,12 +56,12 @@ class Loop:
 
         Raises UserError for settings that the task refuses, and for a checkpoint that does not fit.
         """
-        training, self._begun = as_begun(training, gang)
+        training, self._earlier_settings = as_begun(training, gang)
         job = training.job
         self.training, self.job, self.config, self.gang, self.stop = training, job, training.config, gang, stop
-        self._hooks = hooks
+        own = [FaultInjection(os.environ, job)] if gang.is_main else []
+        self._hooks: Sequence[Hook] = [*own, Reporting(self), *hooks]
         self.share = WorldShare.of(gang.rank, gang.size, total_worlds(job, gang))
-        self._kill_at = kill_at(os.environ, job) if gang.is_main else None
         self.cadence = Cadence(training.save_every)
         self._save_is_due = self._order_is_due = self._is_scheduled = False
         self._longest = patience_of(os.environ) / 2
@@ -78,9 +69,12 @@ class Loop:
         self.exits = False
         """Whether a request to exit is being carried out."""
         self.beacon = Beacon()
-        self.task, self.algorithm = self._build()
-        self._observations = observed(self.task)
-        self._step = transition(self.task, self._observations)
+        seed_generators(training.seed)  # the learner's weights are drawn alike on all ranks
+        self.task = build_task(training.task_type, self.config, self.share, gang, training.seed, self.beacon)
+        kind, settings = training.algorithm_type, training.settings
+        self.algorithm = build_algorithm(kind, settings, self.task, self.share, gang, training.seed)
+        check_state(self.algorithm, training.algorithm)
+        self._step = transition(self.task)
         self.incident = Incident(self.task, self.share, self.algorithm.steps, job.section, training.seed)
         seed_generators(training.seed, gang.rank)
         facts = describe(training, self.task, described_policy(training, self.task))
@@ -89,46 +83,33 @@ class Loop:
         self.resumed = self.state.restore()
         self.adopted = None if self.resumed else self._begin_run(facts)
         """Checkpoint with a clone's initial weights; None for a run that began with new ones, or has a checkpoint of its own."""
+        self.step_log: StepLog | None = None
         if gang.is_main:
             write_contract(job, facts["contract"])
-        self.step_log = self._step_log(facts) if gang.is_main else None
+            try:
+                with user_errors():  # for a link in its place
+                    done = self.state.progress.iteration
+                    self.step_log = self.task.step_log(job.run, self.algorithm.steps, done, facts)
+            except OSError as error:
+                raise TrainingError(f"{error.filename or job.run.path}: {error.strerror or error}") from None
         self.task.clear_statistics()
         self.iterated = 0
         """Iterations that this process has done."""
         self._warnings = 0
-        self._told_captured = False
         self._stopwatch = Stopwatch(gang.device)
         self._stall_seconds = 0.0
         captures = self.algorithm.captures_rollout and not self.task.waits_for_host
-        captured = gang.device if captures else "cpu"
-        self._collecting = CudaGraphFunction(self._collect, captured, "rollout")
+        self._collecting = CudaGraphFunction(self._collect, gang.device if captures else "cpu", "rollout")
         self._exchange = Exchange(gang, self.task)
         self.reporter, self.fence = Reporter(self.gate), Fence(job.run, job.epoch)
         self.failures = Failures(self.task, lambda line: self.reporter.do(_print, line))
         self.state.saver.start()
         end_startup()
 
-    def _build(self) -> tuple[Task, Algorithm]:
-        """This rank's worlds and the learner; the learner's weights are drawn alike on all ranks."""
-        training, gang = self.training, self.gang
-        seed_generators(training.seed)
-        task = build_task(training.task_type, training.config, self.share, gang, training.seed, self.beacon)
-        made = build_algorithm(training.algorithm_type, training.settings, task, self.share, gang, training.seed)
-        check_state(made, training.algorithm)
-        return task, made
-
-    def _step_log(self, facts: dict[str, Any]) -> StepLog | None:
-        """The task's log of control steps. Raises UserError if a link is in its place, TrainingError if the store does not take it."""
-        try:
-            with user_errors():
-                return self.task.step_log(self.job.run, self.algorithm.steps, self.state.progress.iteration, facts)
-        except OSError as error:
-            raise TrainingError(f"{error.filename or self.job.run.path}: {error.strerror or error}") from None
-
     def _begin_run(self, facts: dict[str, Any]) -> Checkpoint | None:
         """Start a run for the first time; returns a clone's checkpoint with the initial weights."""
         adopted = adopt(self.job, self.gang, self.algorithm, facts)
-        give_teacher(self.job, self.gang, self.algorithm, adopted)
+        load_teacher(self.job, self.gang, self.algorithm, adopted)
         self.task.set_random_episode_length()
         return adopted
 
@@ -138,60 +119,41 @@ class Loop:
         Raises TrainingError for a non-finite loss; the last checkpoint remains valid.
         """
         progress = self.state.progress
-        report = Report(self.training, progress.iteration, self.gang.device) if self.gang.is_main else None
-        self.say("\n".join(filter(None, [*self.task.notes(), self._beginning(), self._begun])))
+        self.say("\n".join(filter(None, [*self.task.notes(), self._beginning(), self._earlier_settings])))
         self._stopwatch.begin()
-        self.beacon.tell(phase=Phase.TRAINING)
+        self.beacon.send(phase=Phase.TRAINING)
         try:
             for hook in self._hooks:
                 hook.begin(self)
             while progress.iteration < self.training.iterations:
-                if any([hook.before_iteration() for hook in self._hooks]):  # each is asked
+                if any([hook.before_iteration() for hook in self._hooks]):  # each is called
                     self._collecting.release()
                 record, signals = self._iterate()
-                if progress.iteration == self._kill_at:
-                    die()
-                self.fence.check()
-                if report:
-                    self.reporter.do(self.fence.guard, report.iteration, record)
-                self._tell_captured()
-                self.beacon.tell(iteration=progress.iteration, steps_per_second=record["steps_per_second"])
+                for hook in self._hooks:
+                    hook.iteration(record)
                 if self._handle(signals):
-                    self.say(f"asked to stop: left after iteration {progress.iteration} of {self.training.iterations}")
+                    self.say(f"stop requested: left after iteration {progress.iteration} of {self.training.iterations}")
                     return EX_TEMPFAIL
             checkpoint = complete(self)
-            self.failures.tell(again=True)
+            self.failures.report(again=True)
             for hook in self._hooks:
                 hook.trained(self, checkpoint)
             return 0
         finally:
-            if report:
-                self.reporter.do(report.close)
-            self.reporter.close()
-            self.fence.close()
             for hook in self._hooks:
                 hook.close()
+
+    @property
+    def graphs(self) -> list[CudaGraphFunction]:
+        """The parts of an iteration that run as CUDA graphs."""
+        return [self._collecting, *self.algorithm.graphs]
 
     def close(self) -> None:
         """Leave the gang and end the saver; the loop can't train afterwards."""
         self.state.saver.close()
-        for part in (self._collecting, *self.algorithm.graphs):
+        for part in self.graphs:
             part.release()
         self.gang.close()
-
-    def _tell_captured(self) -> None:
-        """Log once which parts of the iteration run as CUDA graphs."""
-        parts = [self._collecting, *self.algorithm.graphs]
-        if (
-            not self._told_captured
-            and all(part.captured or not part.can_be_captured for part in parts)
-            and any(part.captured for part in parts)
-        ):
-            self._told_captured = True
-            self.say(
-                "captured as CUDA graphs: "
-                + ", ".join(f"{part.name} ({part.seconds:.1f} s to record)" for part in parts if part.captured)
-            )
 
     def _handle(self, signals: dict[str, float]) -> bool:
         """Save when a save is due, and log the results of earlier saves; returns whether the gang exits (then everything is saved)."""
@@ -210,9 +172,9 @@ class Loop:
             self._order_is_due = self._collecting.can_be_captured and state.is_copied and not is_last
             if not self._order_is_due:
                 self._order(wait=is_last)
-        self.tell_saved(state.saver.poll())
+        self.report_saves(state.saver.poll())
         if stopping:
-            self.tell_saved(state.finish())
+            self.report_saves(state.finish())
         return stopping
 
     def _order(self, *, wait: bool = False) -> None:
@@ -224,24 +186,23 @@ class Loop:
         self._stall_seconds = self.state.saver.stall
 
     def _beginning(self) -> str:
-        there = f"{counted(self.share.total, 'world')} on {counted(self.gang.size, 'rank')}"
+        worlds = f"{counted(self.share.total, 'world')} on {counted(self.gang.size, 'rank')}"
         if self.adopted:
             parent = (self.job.run.description() or {}).get("parent") or {}
             of = f"{parent.get('run')}@{self.adopted.iteration} (checkpoint {self.adopted.name})"
-            return f"starting from the weights of {of}: {there}"
+            return f"starting from the weights of {of}: {worlds}"
         if self.resumed is None:
-            return f"starting from new weights: {there}"
-        found = (
-            f"resumed from checkpoint {self.resumed.name}: {there} ({self.resumed.size / 1e6:.2f} MB in {self.state.load_seconds:.3f} s)"
-            + "".join(f"; {line}" for line in self.state.set_anew)
-        )
-        return "\n".join(filter(None, [found, self.task.begins_anew()]))
+            return f"starting from new weights: {worlds}"
+        loaded = f"{self.resumed.size / 1e6:.2f} MB in {self.state.load_seconds:.3f} s"
+        changes = "".join(f"; {line}" for line in self.state.set_anew)
+        resumed = f"resumed from checkpoint {self.resumed.name}: {worlds} ({loaded}){changes}"
+        return "\n".join(filter(None, [resumed, self.task.begins_anew()]))
 
-    def tell_saved(self, lines: list[str]) -> None:
+    def report_saves(self, lines: list[str]) -> None:
         """Log the results of saves."""
         for line in filter(None, lines):
             self.reporter.do(_print, line)
-            self.beacon.tell(said=line)
+            self.beacon.send(said=line)
 
     def _iterate(self) -> tuple[dict[str, Any], dict[str, float]]:
         """One iteration; its numbers (all ranks together), and the sums of :data:`SIGNALS` over the ranks."""
@@ -256,7 +217,7 @@ class Loop:
             self.step_log.copy()
         self._stopwatch.mark()
         self._exchange.gather(self._stopwatch.collect, self._signals())
-        metrics = algorithm.learn(self._observations)
+        metrics = algorithm.learn(self._step.observations)
         if self.iterated == 0:
             check_metrics(metrics, self.training.algorithm)
         self._stopwatch.mark()
@@ -271,7 +232,7 @@ class Loop:
             self.reporter.do(self.fence.guard, self.step_log.write, progress.iteration, self.step_log.taken())
         if self._collecting.can_be_captured:
             self.gate.shut()
-        signals = {name: totals[name][0] for name in SIGNALS}
+        signals = dict(zip(SIGNALS, totals["signals"], strict=True))
         progress.iteration += 1
         self.state.learning_rate = learnt.get("learning_rate")
         self.iterated += 1
@@ -287,7 +248,7 @@ class Loop:
 
     def _failure(self, what: str, hint: str, cause: str = "") -> TrainingError:
         """Build the error that ends training, for an unlike reason with an unlike ``cause``. Every rank must call it."""
-        self.tell_saved(self.state.finish())
+        self.report_saves(self.state.finish())
         last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}", cause)
 
@@ -298,15 +259,15 @@ class Loop:
         found = [self.task.read_mishap(int(code)) for code in mishaps]
         rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
         world += WorldShare.of(rank, self.gang.size, total).first
-        said = f"{counted(resets, 'reset')} of worlds, among them world {world}: {cause}"
+        what = f"{counted(resets, 'reset')} of worlds, among them world {world}: {cause}"
         if resets <= math.ceil(self.config.nan_limit * total):
             self._warnings += 1
             if self._warnings <= WARNINGS:
-                said += "; from now on only counted" if self._warnings == WARNINGS else ""
-                self.say(f"warning: iteration {iteration}: {said}")
-                self.failures.tell()
+                what += "; from now on only counted" if self._warnings == WARNINGS else ""
+                self.say(f"warning: iteration {iteration}: {what}")
+                self.failures.report()
             return
-        self.failures.tell()
+        self.failures.report()
         files = [self.job.run.incidents / f"{iteration:08d}-rank-{number}.pt" for number in range(self.gang.size)]
         problem = ""
         if found[self.gang.rank]:
@@ -315,10 +276,10 @@ class Loop:
             except OSError as error:
                 problem = f" (it could not be written: {error.strerror})"
         self.gang.greatest(0)  # no rank ends the gang before every rank has written
-        where = "" if self.gang.device == "cpu" else " --device cuda:0"
+        device = "" if self.gang.device == "cpu" else " --device cuda:0"
         failure = self._failure(
-            f"{said}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
-            f"See it happen again: python -m worker.repeat_incident {files[rank]}{where}{problem}",
+            f"{what}; that is more than nan_limit, {self.config.nan_limit:g} times {total} worlds",
+            f"See it happen again: python -m worker.repeat_incident {files[rank]}{device}{problem}",
             cause,
         )
         raise UserError(str(failure)) if self.task.is_users_fault(cause) else failure
@@ -350,7 +311,7 @@ class Loop:
     def _collect(self) -> None:
         self.incident.keep()
         for step in range(self.algorithm.steps):
-            actions = self.algorithm.act(self._observations)
+            actions = self.algorithm.act(self._step.observations)
             if self.iterated == 0:
                 check_actions(actions, self.task.actions.shape, self.training.algorithm)
             self.incident.note(step, actions)
@@ -361,42 +322,31 @@ class Loop:
         """Bring the progress up to date with the ``totals`` of all ranks; the iteration's record without the losses."""
         progress = self.state.progress
         self._stopwatch.read()
-        took = self._stopwatch.iteration
+        seconds = self._stopwatch.iteration
         steps = self.share.total * self.algorithm.steps
         progress.env_steps += steps
-        self.state.seconds += took
+        self.state.seconds += seconds
         stall, self._stall_seconds = self._stall_seconds, 0.0
         known = dict(zip(self.task.statistic_names, totals, strict=True))
         finished, returns, lengths, squares = map(known.pop, EPISODES)
         if finished:
             progress.reward, progress.episode_length = returns / finished, lengths / finished
-        progress.count(
-            self.algorithm.steps,
-            finished,
-            returns,
-            squares,
-            worlds=self.share.total,
-            longest=self.task.max_episode_length,
-        )
+        ended = EndedEpisodes(self.algorithm.steps, finished, returns, squares)
+        progress.count(ended, worlds=self.share.total, longest=self.task.max_episode_length)
+        figures = figures_of(known, finished, lengths, self.task.final_metrics)
+        curricula = self.config.curriculum.items()
+        shown = ("iteration", "env_steps", "reward", "episode_length", "score", "score_error")
         return {
-            "iteration": progress.iteration,
-            "env_steps": progress.env_steps,
-            "reward": progress.reward,
-            "episode_length": progress.episode_length,
-            "score": progress.score,
-            "score_error": progress.score_error,
+            **{name: getattr(progress, name) for name in shown},
             "episodes": int(finished),
-            "steps_per_second": steps / took,  # by the clock, over everything
+            "steps_per_second": steps / seconds,  # by the clock, over everything
             "collect_seconds": self._stopwatch.collect,
             "learn_seconds": self._stopwatch.learn,
-            "iteration_seconds": took,
+            "iteration_seconds": seconds,
             "stall_seconds": stall,  # of the save before this iteration, 0 without one
             "total_seconds": self.state.seconds,
-            **{
-                f"curriculum_{name}": value_at(points, progress.iteration - 1)
-                for name, points in self.config.curriculum.items()
-            },
-            **(figures := figures_of(known, finished, lengths, self.task.final_metrics)),
+            **{f"curriculum_{name}": value_at(points, progress.iteration - 1) for name, points in curricula},
+            **figures,
             **shown_of(figures, self.task.shown_metrics),
         }
 

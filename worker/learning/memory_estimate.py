@@ -19,7 +19,7 @@ import torch
 from worker.learning.algorithm import Algorithm, WorldShare
 from worker.learning.distributed import Gang
 from worker.learning.host_copies import HostCopies
-from worker.learning.setup import build_algorithm, build_task, load_kernels, observed, transition
+from worker.learning.setup import build_algorithm, build_task, load_kernels, transition
 from worker.settings.errors import UserError, is_out_of_memory
 
 if TYPE_CHECKING:
@@ -120,19 +120,17 @@ def _taken(task_type: type[Task], config: TaskConfig, learner: Learner, worlds: 
     before = _start_measuring(gang.device)
     share = WorldShare(0, worlds, worlds)
     task = build_task(task_type, config, share, gang, 0)
-    kind, settings = learner
-    algorithm = build_algorithm(kind, settings, task, share, alone, 0, rehearsal=True)
-    observations = observed(task)
-    step = transition(task, observations)
+    algorithm = build_algorithm(*learner, task, share, alone, 0, rehearsal=True)
+    step = transition(task)
     algorithm.begin(0)
     for _ in range(algorithm.steps):
-        algorithm.act(observations)
+        algorithm.act(step.observations)
         algorithm.record(step)
-    algorithm.learn(observations)
+    algorithm.learn(step.observations)
     copies = HostCopies()  # which a save makes
     copied = copies.take((task.state_tensors(), dict(algorithm.world_state()), algorithm.state_dict()))
     taken = _most(gang.device) - before
-    del task, algorithm, observations, step, copies, copied
+    del task, algorithm, step, copies, copied
     gc.collect()
     return max(taken, 0)
 

@@ -1,4 +1,4 @@
-"""A run's reports: a log line per iteration, the metrics file, TensorBoard events."""
+"""A run's reports: a log line per iteration, the metrics file, TensorBoard events, failures of a user's functions."""
 
 from __future__ import annotations
 
@@ -9,16 +9,21 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import torch
 
+from shared_store.contract.error_text import counted
 from shared_store.volume.learning_metrics import in_log
 from shared_store.volume.metrics import MetricsWriter, sampled, scalars, warnings_of
+from worker.learning.hooks import Hook
 from worker.learning.watch import HISTORY, Watch
 
 if TYPE_CHECKING:
+    from worker.learning.loop import Loop
     from worker.learning.training import Training
+    from worker.tasks.run.task_report import Telling
 
 
 class Stopwatch:
@@ -49,7 +54,10 @@ class Stopwatch:
         """The iteration is over, and the device was waited for."""
         now = time.perf_counter()
         self.iteration, self._read_at = now - self._read_at, now
-        self.collect, self.learn = self.parts()
+        self.collect, self.learn = (
+            before.elapsed_time(after) / 1000.0 if self._cuda else after - before
+            for before, after in pairwise(self._marks)
+        )
 
     def mark(self) -> None:
         """The end of one part and the start of the next."""
@@ -60,18 +68,50 @@ class Stopwatch:
         event.record()
         self._marks.append(event)
 
-    def parts(self) -> list[float]:
-        """Duration of each part [s]."""
-        pairs = list(zip(self._marks, self._marks[1:], strict=False))
-        if not self._cuda:
-            return [after - before for before, after in pairs]
-        return [before.elapsed_time(after) / 1000.0 for before, after in pairs]
+
+class Reporting(Hook):
+    """Reports the iterations of a training: to its log, metrics and supervisor. Writes nothing once a newer attempt owns the run."""
+
+    def __init__(self, loop: Loop) -> None:
+        self._loop = loop
+        self._report: Report | None = None
+        self._has_reported_graphs = False
+
+    def begin(self, loop: Loop) -> None:
+        if loop.gang.is_main:
+            self._report = Report(loop.training, loop.state.progress.iteration, loop.gang.device)
+
+    def iteration(self, record: dict[str, Any]) -> None:
+        """Raises StaleEpoch if a newer attempt owns the run."""
+        loop = self._loop
+        loop.fence.check()
+        if self._report:
+            loop.reporter.do(loop.fence.guard, self._report.iteration, record)
+        captured = [part for part in loop.graphs if part.captured]
+        is_settled = all(part.captured or not part.can_be_captured for part in loop.graphs)
+        if captured and is_settled and not self._has_reported_graphs:
+            self._has_reported_graphs = True
+            parts = ", ".join(f"{part.name} ({part.seconds:.1f} s to record)" for part in captured)
+            loop.say(f"captured as CUDA graphs: {parts}")
+        loop.beacon.send(iteration=record["iteration"], steps_per_second=record["steps_per_second"])
+
+    def close(self) -> None:
+        if self._report:
+            self._loop.reporter.do(self._report.close)
+        self._loop.reporter.close()
+        self._loop.fence.close()
 
 
 LONG_HOURS = 6.0
 """Estimated duration of a training without a GPU above which a warning is logged."""
 WARMED = 2
 """The first iteration of an attempt whose rate is reported: the very first one also loads kernels."""
+_SLOW, _NOTICED = 0.1, 0.1
+"""A rank is reported as slow if waiting for it costs this share of the time, and this time of an iteration [s]."""
+_MOST_RANKS = 32
+"""Greatest number of ranks whose figures a record lists one by one."""
+_MOST_FAILURES = 10
+"""Lines about failures at once."""
 
 
 class Report:
@@ -87,36 +127,33 @@ class Report:
         from torch.utils.tensorboard import SummaryWriter
 
         job, self._iterations = training.job, training.iterations
-        self._task = str(job.section.get("task"))
+        self._task, self._run = str(job.section.get("task")), job.run
         self._rated_at = resumed_from + WARMED if device == "cpu" else 0
-        self._warned = False
         self._metrics = MetricsWriter(job.run, job.epoch, resumed_from)
-        directory = job.run.metrics
-
-        def events(first: int) -> SummaryWriter:
-            directory.stat()  # it would be made where another volume is
-            return SummaryWriter(str(directory), purge_step=first, filename_suffix=f".e{job.epoch}", flush_secs=10)
-
-        self._run = job.run.name
         self._watch = Watch(self._iterations, getattr(training, "settings", None))
         with suppress(OSError):  # without them it begins anew
-            earlier = sampled(job.run, HISTORY) if resumed_from else []
-            self._watch.follow(record for record in earlier if record["iteration"] <= resumed_from)
-        self._warned_of = set[str]()
+            for record in sampled(job.run, HISTORY) if resumed_from else []:
+                if record["iteration"] <= resumed_from:
+                    self._watch.warnings(record)
+        self._has_failed, self._warned_of = False, set[str]()
         threading.excepthook = partial(_thread_failed, threading.excepthook)
-        self._new_events = events
+        self._new_events = partial(SummaryWriter, str(job.run.metrics), filename_suffix=f".e{job.epoch}", flush_secs=10)
         self._events: SummaryWriter | None = None
 
     def iteration(self, record: dict[str, Any]) -> None:
         """Print and store one iteration's ``record``."""
         width = len(str(self._iterations))
+        shown = "".join(f"{name} {text}  " for name, text in record.get("shown", {}).items())
         mishaps = "".join(
             f"  {name} {record[name]:.0f}" for name in ("nan_worlds", "solver_overflows") if record.get(name)
         )
+        excess = record.get("slowest_excess") or 0.0
+        if excess > _SLOW and excess * (record["collect_seconds"] or 0.0) > _NOTICED:
+            mishaps += f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)"
         print(
             f"iteration {record['iteration']:>{width}}/{self._iterations}  reward {_text(record['reward'], '.2f')}  "
-            f"length {_text(record['episode_length'], '.1f')}  {_shown(record)}steps/s {record['steps_per_second']:.0f}  "
-            f"{in_log(record)}{mishaps}{_slow(record)}",
+            f"length {_text(record['episode_length'], '.1f')}  {shown}steps/s {record['steps_per_second']:.0f}  "
+            f"{in_log(record)}{mishaps}",
             flush=True,
         )
         if record["iteration"] == self._rated_at and (warning := self._long(record)):
@@ -125,9 +162,15 @@ class Report:
             key: value if not isinstance(value, float) or math.isfinite(value) else None
             for key, value in record.items()
         }
-        if warnings := self._watch.look(finite):
+        if warnings := self._watch.warnings(finite):
             finite["warnings"] = warnings
-        self._warn(warnings_of(finite, self._run))
+        for text in warnings_of(finite, self._run.name):
+            kind = text.partition(":")[0]
+            if (
+                kind not in self._warned_of
+            ):  # each kind once: some come and go, and their numbers change in every iteration
+                self._warned_of.add(kind)
+                print(f"warning: {text}", flush=True)
         failures = list[OSError]()
         for write in (self._write_record, self._write_events):
             try:
@@ -136,29 +179,22 @@ class Report:
                 failures.append(error)
                 if self._events is None:
                     break  # on a full volume each iteration would begin another, empty file
-        if failures and not self._warned:
+        if failures and not self._has_failed:
             print(f"warning: metrics can't be written ({failures[0]}); training continues and retries", flush=True)
-        self._warned = bool(failures)
-
-    def _warn(self, warnings: Sequence[str]) -> None:
-        """Print each kind of warning once: some come and go, and their numbers change in every iteration."""
-        for text in warnings:
-            kind = text.partition(":")[0]
-            if kind not in self._warned_of:
-                self._warned_of.add(kind)
-                print(f"warning: {text}", flush=True)
+        self._has_failed = bool(failures)
 
     def _write_record(self, record: Mapping[str, Any]) -> None:
         self._metrics.write({**record, "time": time.time()})
 
     def _write_events(self, record: Mapping[str, Any]) -> None:
         if self._events is None:
-            self._events = self._new_events(record["iteration"])
+            self._run.metrics.stat()  # it would be made where another volume is
+            self._events = self._new_events(purge_step=record["iteration"])
         try:
             for name, value in scalars(record).items():
                 self._events.add_scalar(name, value, record["iteration"])
         except OSError:
-            self._events = None  # the writer's thread has ended: another file is begun once the volume takes one
+            self._events = None  # the writer's thread has ended: the next record opens another file
             raise
 
     def _long(self, record: dict[str, float | int | None]) -> str:
@@ -209,24 +245,6 @@ def shown_of(figures: Mapping[str, float | None], metrics: Mapping[str, str]) ->
     }
 
 
-def _shown(record: Mapping[str, Any]) -> str:
-    return "".join(f"{name} {text}  " for name, text in record.get("shown", {}).items())
-
-
-def _slow(record: dict[str, float | int | None]) -> str:
-    """The rank for which the others wait, if that costs a tenth of the time, and a noticeable time."""
-    excess = record.get("slowest_excess") or 0.0
-    is_slow = excess > _SLOW and excess * (record["collect_seconds"] or 0.0) > _NOTICED
-    return f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)" if is_slow else ""
-
-
-_SLOW = 0.1
-_NOTICED = 0.1
-"""Seconds of an iteration."""
-_MOST_RANKS = 32
-"""Ranks of which each is told by itself in a record."""
-
-
 def _text(value: float | None, form: str) -> str:
     return "-" if value is None else format(value, form)
 
@@ -250,3 +268,23 @@ def _thread_failed(hook: Callable[[threading.ExceptHookArgs], object], failure: 
     """TensorBoard raises a failure of its thread again where the next event is added: its traceback says nothing more."""
     if not type(failure.thread).__module__.startswith("tensorboard."):
         hook(failure)
+
+
+class Failures:
+    """Reports each failure of a user's functions, such as a learner's reward, once, and all of them at the end. Every rank reports its own.
+
+    Args:
+        task: The task with the functions.
+        say: Writes a line to the log.
+    """
+
+    def __init__(self, task: Telling, say: Callable[[str], None]) -> None:
+        self._task, self._say = task, say
+        self._reported: set[str] = set()
+
+    def report(self, *, again: bool = False) -> None:
+        """Report new failures, or all of them if ``again``; waits for the device."""
+        found = [item for item in self._task.failures().items() if again or item[0] not in self._reported]
+        for text, (count, world) in found[:_MOST_FAILURES]:
+            self._reported.add(text)
+            self._say(f"warning: {text} ({counted(count, 'call')} so far, first in world {world})")

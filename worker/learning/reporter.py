@@ -1,16 +1,18 @@
 """The reporter and the fence of a training: threads that read and write the volume, so that the training thread waits for no disk or network.
 
-If the volume is away for an hour, the run loses only its newest metrics.
+If the volume is unreachable for an hour, the run loses only its newest metrics.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
+import os
 import queue
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from shared_store.contract.error_text import counted
@@ -37,8 +39,8 @@ class Fence:
     def __init__(self, run: Run, epoch: int) -> None:
         self._run, self._epoch = run, epoch
         self._problem: Exception | None = None
-        self._looked = time.monotonic()
-        self._over = threading.Event()
+        self._read_at = time.monotonic()
+        self._closed = threading.Event()
         threading.Thread(target=self._watch, name="fence", daemon=True).start()
 
     def check(self) -> None:
@@ -52,30 +54,28 @@ class Fence:
         A stopped process that continues would otherwise write before its next read.
         """
         patience = time.monotonic() + _PATIENT
-        while self._problem is None and not self._over.is_set() and self._is_late(patience):
+        while (
+            self._problem is None and not self._closed.is_set() and self._read_at + _LATE < time.monotonic() < patience
+        ):
             time.sleep(0.01)
         if self._problem is None:
             write(*arguments)
 
-    def _is_late(self, patience: float) -> bool:
-        now = time.monotonic()
-        return now - self._looked > _LATE and now < patience
-
     def close(self) -> None:
         """Stop reading."""
-        self._over.set()
+        self._closed.set()
 
     def _watch(self) -> None:
-        while not self._over.is_set():
+        while not self._closed.is_set():
             try:
-                # the volume is away for a while: try again at the next read
+                # the volume is unreachable: try again at the next read
                 with contextlib.suppress(OSError, ValueError):
                     check_epoch(self._run, self._epoch)
             except Exception as error:  # StaleEpoch; a defect must not end the fence unseen
                 self._problem = error
                 return
-            self._looked = time.monotonic()
-            self._over.wait(_EVERY)
+            self._read_at = time.monotonic()
+            self._closed.wait(_EVERY)
 
 
 class Gate:
@@ -147,3 +147,27 @@ def _warn(error: Exception) -> None:
             end="",
             flush=True,
         )
+
+
+class Beacon:
+    """Messages of a rank to its supervisor, one JSON line each on an inherited pipe: ``phase``
+    (:class:`shared_store.contract.phases.Phase`), ``iteration`` and ``steps_per_second``, ``said`` (of a save), ``done``.
+
+    A message that finds the pipe full is dropped: the supervisor needs the newest, and the loop must not wait for it.
+    Without a supervisor (torchrun, a debugger) nothing is sent.
+    """
+
+    def __init__(self, env: Mapping[str, str] | None = None) -> None:
+        number = (os.environ if env is None else env).get("MUSTER_PROGRESS_FD", "")
+        self._descriptor = int(number) if number.isdecimal() else None
+
+    def send(self, **message: Any) -> None:
+        """Send one message of JSON values; does not wait."""
+        if self._descriptor is None:
+            return
+        try:
+            os.write(self._descriptor, json.dumps(message).encode() + b"\n")
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._descriptor = None  # the supervisor no longer listens

@@ -1,8 +1,9 @@
-"""Asynchronous saving: the training loop stops only while the state is copied to host memory."""
+"""Asynchronous saving: when a checkpoint is due, and how it is written while the training loop stops only for a copy to host memory."""
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import select
 import signal
@@ -27,6 +28,37 @@ PATIENCE = 2.0
 """Time after the order of the oldest save for which a third one waits [s]; after it, the volume counts as hanging, and training goes on."""
 RECORDS_SECONDS = 10.0
 """Longest wait of a commit for the earlier metrics records [s]: a checkpoint is worth more than records that are never written."""
+
+
+OVERHEAD = 0.01
+"""Share of the time that ``every: auto`` spends on saving."""
+_FIRST = 5
+"""Iterations to the first save, and the minimum between two saves, of ``every: auto``."""
+_LONGEST = 1000
+
+
+class Cadence:
+    """When the next checkpoint is due: every so many iterations, or (``auto``) as often as :data:`OVERHEAD` allows (after CheckFreq, FAST'21)."""
+
+    def __init__(self, every: int | str) -> None:
+        self.auto = every == "auto"
+        self.every = _FIRST if self.auto else int(every)
+        self._last = 0
+
+    def expects(self, iteration: int) -> bool:
+        """Whether a save after ``iteration`` is likely, before its signals are known."""
+        return iteration - self._last >= self.every if self.auto else iteration % self.every == 0
+
+    def due(self, iteration: int, signals: Mapping[str, float]) -> bool:
+        """Whether to save after ``iteration``. All ranks decide alike, since ``signals`` are sums over all of them."""
+        if self.auto and signals["stall"] > 0 and signals["iteration_seconds"] > 0:
+            needed = math.ceil(signals["stall"] / (OVERHEAD * signals["iteration_seconds"]))
+            # not at once: if the loop only sometimes waits for the volume, the next save alone does not show it
+            self.every = min(max(needed, self.every // 2, _FIRST), _LONGEST)
+        if not self.expects(iteration):
+            return False
+        self._last = iteration
+        return True
 
 
 class _Save(NamedTuple):
@@ -58,7 +90,7 @@ class Saver:
         self._copies = HostCopies()
         self._memory = [os.fdopen(os.memfd_create("muster-snapshot"), "wb", 1 << 20) for _ in range(_BUFFERS)]
         self._records = os.fdopen(os.memfd_create("muster-records"), "wb")
-        self._given = 0
+        self._orders = 0
         self._pending: list[_Save] = []
         self._thread = ThreadPoolExecutor(1, "snapshots")
         self._process: subprocess.Popen[bytes] | None = None
@@ -77,7 +109,7 @@ class Saver:
         return len(self._pending) >= _BUFFERS and self._patience() == 0.0
 
     def note_records(self, iteration: int) -> None:
-        """Tell the writer that the metrics records up to ``iteration`` are written. Any thread may call it."""
+        """Inform the writer that the metrics records up to ``iteration`` are written. Any thread may call it."""
         os.pwrite(self._records.fileno(), iteration.to_bytes(8, "little"), 0)
 
     def copy(self, state: Any) -> Any:
@@ -120,8 +152,8 @@ class Saver:
                 self._fail(iteration, "earlier saves are still being written")
                 self.stall = time.perf_counter() - started
                 return
-        memory = self._memory[self._given % _BUFFERS]
-        self._given += 1
+        memory = self._memory[self._orders % _BUFFERS]
+        self._orders += 1
         order = {
             "run": str(self.run.path),
             "iteration": iteration,
@@ -156,13 +188,13 @@ class Saver:
         """Results of earlier saves, a line for each that ended; does not wait. Raises StaleEpoch."""
         while self._pending and self._take_answer(0.0):
             pass
-        return self._told()
+        return self._new_lines()
 
     def wait(self) -> list[str]:
         """As :meth:`poll`, but waits for all saves in progress. Raises StaleEpoch."""
         while self._pending:
             self._take_answer(None)
-        return self._told()
+        return self._new_lines()
 
     def abandon(self) -> None:
         """Another rank's part of a save failed: the main rank's writer must not wait for it."""
@@ -185,7 +217,7 @@ class Saver:
         """Remaining time for which a save waits for the oldest one [s]."""
         return max(0.0, self._pending[0].since + PATIENCE - time.perf_counter())
 
-    def _told(self) -> list[str]:
+    def _new_lines(self) -> list[str]:
         lines, self._lines = self._lines, []
         return lines
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -20,9 +20,9 @@ from shared_store.volume.epoch import check_epoch
 from shared_store.volume.files import read_json, write_json
 from worker.learning.algorithm import Algorithm, ExportedPolicy, LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.algorithms import refuse_incomplete
-from worker.learning.beacon import Beacon
 from worker.learning.distributed import Gang, warm_marker
 from worker.learning.job import Job, user_errors
+from worker.learning.reporter import Beacon
 from worker.settings.errors import UserError
 from worker.simulation.robot_values import shown_value
 from worker.tasks.run.adapting import begin_evaluation
@@ -32,7 +32,6 @@ from worker.tasks.run.policy_contract import policy_contract, readings_of, robot
 if TYPE_CHECKING:
     from worker.learning.training import Training
     from worker.settings.task import TaskConfig
-    from worker.simulation.robot_comparison import RobotDifference
     from worker.tasks.run.task import Task
 
 
@@ -46,7 +45,7 @@ def build_task(
     marker = warm_marker(task_type, gang.device)
     is_cold = marker is not None and not marker.exists()
     if beacon is not None:
-        beacon.tell(phase=Phase.COMPILING if is_cold else Phase.BUILDING)
+        beacon.send(phase=Phase.COMPILING if is_cold else Phase.BUILDING)
     if gang.is_main and is_cold:
         print("compiling kernels: this takes a minute or two, the first time", flush=True)
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
@@ -67,10 +66,10 @@ def total_worlds(job: Job, gang: Gang) -> int:
 
     ``train.worlds`` is each rank's share in a gang of full size; a resumed run has the worlds of its checkpoint.
     """
-    if given := os.environ.get("MUSTER_WORLDS"):
-        if not given.isdecimal() or int(given) < gang.size:
-            raise UserError(f"MUSTER_WORLDS is {given!r}; expected a number of worlds, at least one for each rank")
-        return int(given)
+    if total := os.environ.get("MUSTER_WORLDS"):
+        if not total.isdecimal() or int(total) < gang.size:
+            raise UserError(f"MUSTER_WORLDS is {total!r}; expected a number of worlds, at least one for each rank")
+        return int(total)
     nodes = job.spec.get("nodes")
     full = nodes["max"] * gang.placement.local_world_size if isinstance(nodes, dict) else gang.size
     return job.setting("worlds", 256) * max(full, gang.size)
@@ -80,12 +79,6 @@ def spaces_of(task: Task) -> Spaces:
     """Shapes of the observations and actions of the task's policies."""
     shapes = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items()}
     return Spaces(shapes, task.action_size, task.discrete)
-
-
-def action_ranges(task: Task) -> tuple[tuple[float, float] | None, ...]:
-    """See :attr:`LearningSetting.action_ranges`."""
-    interface = None if task.discrete else task.interface()
-    return tuple(action.clip for action in interface.actions) if interface else ()
 
 
 def spaces_from(policy: dict[str, Any]) -> Spaces:
@@ -111,8 +104,11 @@ def build_algorithm(
         rehearsal: See :attr:`LearningSetting.rehearsal`.
     """
     load_kernels(algorithm, gang)
-    control_seconds = 1.0 / task.config.control_hz
-    setting = LearningSetting(spaces_of(task), share, gang, seed, control_seconds, action_ranges(task), rehearsal)
+    interface = None if task.discrete else task.interface()
+    ranges = tuple(action.clip for action in interface.actions) if interface else ()
+    setting = LearningSetting(
+        spaces_of(task), share, gang, seed, 1.0 / task.config.control_hz, ranges, rehearsal=rehearsal
+    )
     with user_errors("train"):
         built = algorithm(settings, setting)
     refuse_incomplete(built, algorithm.__name__, ("steps", "graphs"))
@@ -124,10 +120,10 @@ def observed(task: Task) -> TensorDict:
     return TensorDict(task.groups, [task.world_count], device=task.device)
 
 
-def transition(task: Task, observations: TensorDict) -> Transition:
+def transition(task: Task) -> Transition:
     """Live views of the result of the task's last step."""
     ended = TensorDict(task.terminal_groups, [task.world_count], device=task.device)
-    return Transition(observations, ended, task.rewards, task.dones, task.time_outs)
+    return Transition(observed(task), ended, task.rewards, task.dones, task.time_outs)
 
 
 def described_policy(training: Training, task: Task) -> ExportedPolicy | None:
@@ -195,8 +191,8 @@ def contract_from(facts: Mapping[str, Any], checkpoint: str) -> Contract | None:
 def begin_as_trained(task: Task, checkpoint: Checkpoint) -> None:
     """Prepare worlds for a checkpoint's policy: set curricula and adaptive numbers as in its training."""
     facts = checkpoint.manifest
-    told = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
-    begin_evaluation(task, *told, facts.get("adaptive_steps", {}))
+    last = max(0, checkpoint.iteration - 1), facts.get("reward"), facts.get("episode_length")
+    begin_evaluation(task, *last, facts.get("adaptive_steps", {}))
 
 
 def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) -> str:
@@ -219,11 +215,12 @@ def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) ->
     if then is not None and then.robots:
         lines = robot_changes(then.robots, robots_of(task))
     else:
-        changed = {
-            name: [each for each in reading.corrected if not each.is_rounding]
-            for name, reading in readings_of(task).items()
-        }
-        lines = [f"{name}: {_before(differences)}" for name, differences in changed.items() if differences]
+        lines = []
+        for name, reading in readings_of(task).items():
+            if found := [each for each in reading.corrected if not each.is_rounding]:
+                first, more = found[0], f" ({len(found) - 1} more)" if len(found) > 1 else ""
+                was, is_now = shown_value(first.built), shown_value(first.file)
+                lines.append(f"{name}: {first.element}: {first.field} was {was}, is {is_now}{more}")
     if not lines:
         return ""
     what = f"{of} was trained on another robot than the file gives now: {brief(lines)}"
@@ -232,12 +229,6 @@ def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) ->
             f"{what}; to go on all the same, add --accept-changed-robot (accept_changed_robot: true in a job's section)"
         )
     return what
-
-
-def _before(found: Sequence[RobotDifference]) -> str:
-    first, more = found[0], len(found) - 1
-    was, is_now = shown_value(first.built), shown_value(first.file)
-    return f"{first.element}: {first.field} was {was}, is {is_now}" + (f" ({more} more)" if more else "")
 
 
 def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any]) -> str:
@@ -256,11 +247,9 @@ def check_contract(checkpoint: Checkpoint, task: Task, section: Mapping[str, Any
     Raises:
         UserError: The meaning of the task's observations, actions or commands changed since the training, or its robot did.
     """
-    facts = checkpoint.manifest
+    facts, of = checkpoint.manifest, f"checkpoint {checkpoint.name}"
     name, then = facts["task"], contract_from(facts, checkpoint.name)
-    accept = bool(section.get("accept_changed_robot"))
-    of = f"checkpoint {checkpoint.name}"
-    changes = check_robots(then, task, of, accept=accept)
+    changes = check_robots(then, task, of, accept=bool(section.get("accept_changed_robot")))
     if then:
         changes = check_fit(then, same_policy(policy_contract(task, name), then), of, changes)
     elif (had := spaces_from(facts["policy"])) != (has := spaces_of(task)):

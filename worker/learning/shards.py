@@ -28,8 +28,8 @@ def read_file(checkpoint: Checkpoint, name: str, device: str = "cpu") -> dict[st
             "that you trust"
         ) from error
     except Exception as error:  # torch's reader can raise anything on a file that is not a checkpoint
-        said = str(error).splitlines() or [type(error).__name__]
-        raise UserError(f"{where} can't be loaded: {said[0]}") from error
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise UserError(f"{where} can't be loaded: {lines[0]}") from error
     if not isinstance(content, dict):
         raise UserError(f"{where} holds a {type(content).__name__}, not the state of a training")
     return content

@@ -14,8 +14,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import torch
-
 from shared_store.contract.error_text import counted
 from shared_store.contract.policy_changes import brief, differences
 from shared_store.volume.checkpoints import (
@@ -36,6 +34,7 @@ from worker.learning.randomness import generator_state, restore_generators
 from worker.learning.saving import Saver
 from worker.learning.setup import check_robots, contract_from
 from worker.learning.shards import Shards, read_file
+from worker.learning.trained import chosen_by_main
 from worker.settings.errors import UserError
 from worker.tasks.run.adapting import adaptive_steps
 
@@ -58,13 +57,13 @@ class EndedEpisodes(NamedTuple):
 
 
 class _Copies(NamedTuple):
-    """What was copied for a save that may be ordered after the next iteration has begun."""
+    """The state that was copied for a save that may be ordered after the next iteration began."""
 
-    iteration: int
+    iteration: int = -1
     """Iterations done."""
-    parts: dict[str, Any]
+    parts: dict[str, Any] = {}
     """The copies of the state after them."""
-    adaptive_steps: dict[str, float]
+    adaptive_steps: dict[str, float] = {}
     """The step of each adaptive number in the last of them: the next iteration moves it when it begins."""
 
 
@@ -94,21 +93,13 @@ class Progress:
         does."""
         return {**vars(self), "recent": list(self.recent)}
 
-    def count(self, steps: int, episodes: float, returns: float, squares: float, *, worlds: int, longest: int) -> None:
+    def count(self, ended_now: EndedEpisodes, *, worlds: int, longest: int) -> None:
         """Record the episodes that ended in an iteration, and update the score and its error.
 
-        The score covers at least :data:`EPISODES` episodes, one for each world, and at least as many steps as the longest episode. With
-        fewer, only early ends would count, which are falls.
-
-        Args:
-            steps: Steps of each world.
-            episodes: Number of episodes that ended, over all ranks.
-            returns: Sum of their returns.
-            squares: Sum of the squares of their returns.
-            worlds: Number of worlds of all ranks.
-            longest: Steps of the longest episode.
+        The score covers at least :data:`EPISODES` episodes, one for each of the ``worlds`` of all ranks, and at least as many steps as the
+        ``longest`` episode. With fewer, only early ends would count, which are falls.
         """
-        self.recent.append(list(EndedEpisodes(steps, episodes, returns, squares)))
+        self.recent.append(list(ended_now))
         span = ended = total = spread = 0.0
         for index in reversed(range(len(self.recent))):
             entry = EndedEpisodes(*self.recent[index])
@@ -141,19 +132,13 @@ class TrainingState:
         gate: Gate | None = None,
     ) -> None:
         """``facts``: extra manifest fields (task, configuration), so that a checkpoint can be read on its own. Saving waits at ``gate``."""
-        self.job, self.gang, self.share, self.task, self.algorithm, self.facts = (
-            job,
-            gang,
-            share,
-            task,
-            algorithm,
-            facts,
-        )
+        self.job, self.gang, self.share = job, gang, share
+        self.task, self.algorithm, self.facts = task, algorithm, facts
         self.progress = Progress()
         self.seconds = 0.0
         """Time spent in iterations by all attempts [s]; kept in the manifest, since no two runs take the same time."""
         self.saver = Saver(job.run, job.epoch, gang.rank, gang.size, keep, gate)
-        self._copied = _Copies(-1, {}, {})
+        self._copied = _Copies()
         self.ordered_at: int | None = None
         """Iteration of the newest save that was ordered, or of the checkpoint that was loaded."""
         self.load_seconds = 0.0
@@ -168,9 +153,10 @@ class TrainingState:
 
         Called before the host waits for the iteration's numbers, it costs the host no time: the device copies when it gets there.
         """
+        own = {_OF_ALGORITHM + name: tensor for name, tensor in self.algorithm.world_state().items()}
         worlds = {"first": self.share.first, "count": self.share.count}
         parts = {
-            "worlds": {**worlds, "state": {**self.task.state_tensors(), **self._of_algorithm()}},
+            "worlds": {**worlds, "state": {**self.task.state_tensors(), **own}},
             "generators": generator_state(),
             "algorithm": self.algorithm.state_dict() if self.gang.is_main else {},
         }
@@ -185,10 +171,10 @@ class TrainingState:
         """Order a checkpoint of the present state; every rank calls it. Stops only for the copy to host memory.
 
         Args:
-            reporter: The checkpoint is committed after what ``reporter`` has been given so far: a run that goes on from it has the
+            reporter: The checkpoint is committed after the calls that ``reporter`` has so far: a run that goes on from it has the
                 metrics records before it.
             wait: For earlier saves that are still being written, as long as they take.
-            scheduled: Whether the job asked for a checkpoint at this iteration.
+            scheduled: Whether a checkpoint is due at this iteration by the job's settings or by request.
 
         Raises:
             StaleEpoch: A newer attempt owns the run.
@@ -197,21 +183,15 @@ class TrainingState:
         if not self.is_copied:
             self.copy(iteration)
         copied, adaptive = self._copied.parts, self._copied.adaptive_steps
-        self._copied = _Copies(-1, {}, {})
+        self._copied = _Copies()
         files = {f"rank-{self.gang.rank}.pt": {name: copied[name] for name in ("worlds", "generators")}}
         if self.gang.is_main:
             files["learner.pt"] = {"algorithm": copied["algorithm"], "progress": self.progress.saved()}
         if reporter:
             reporter.do(self.saver.note_records, iteration)
-        facts = None
-        if self.gang.is_main:
-            facts = {**self._manifest(), "adaptive_steps": adaptive, "scheduled": scheduled}
+        facts = {**self._manifest(), "adaptive_steps": adaptive, "scheduled": scheduled} if self.gang.is_main else None
         self.saver.save(iteration, files, facts, after_records=reporter is not None, wait=wait)
         self.ordered_at = iteration
-
-    def _of_algorithm(self) -> dict[str, torch.Tensor]:
-        """Per-world state of the algorithm, named apart from the task's."""
-        return {_OF_ALGORITHM + name: tensor for name, tensor in self.algorithm.world_state().items()}
 
     def finish(self) -> list[str]:
         """Wait until every save is durable or has failed; every rank calls it. Returns lines for the log. Raises StaleEpoch if a newer
@@ -234,12 +214,7 @@ class TrainingState:
             "world_size": self.gang.size,
             "worlds": self.share.total,
             "shards": [[share.first, share.count] for share in shares],
-            "reward": self.progress.reward,
-            "score": self.progress.score,
-            "score_error": self.progress.score_error,
-            "score_episodes": self.progress.score_episodes,
-            "episode_length": self.progress.episode_length,
-            "env_steps": self.progress.env_steps,
+            **{name: getattr(self.progress, name) for name in _IN_MANIFEST},
             "learning_rate": self.learning_rate,
             "seconds": self.seconds,
         }
@@ -253,20 +228,11 @@ class TrainingState:
             UserError: The checkpoint does not fit this job; the message names the difference.
             DamagedCheckpoint: The chosen one can't be used, or the newest one has a newer format.
         """
-        checkpoint, problem = None, ""
-        if self.gang.is_main:
-            try:
-                checkpoint = self._choose()
-            except DamagedCheckpoint as error:
-                problem = str(error)
-        if problem := self.gang.tell(problem) or "":
+        checkpoint, problem = chosen_by_main(self.gang, self.job.run.checkpoints, self._choose, (DamagedCheckpoint,))
+        if problem:
             raise DamagedCheckpoint(problem)
-        name = self.gang.tell(checkpoint.name if checkpoint else None)
-        if name is None:
-            return None
-        iteration, epoch = name.split("-e")
-        checkpoint = Checkpoint(self.job.run.checkpoints / name, int(iteration), int(epoch))
-        self.load(checkpoint)
+        if checkpoint:
+            self.load(checkpoint)
         return checkpoint
 
     def _choose(self) -> Checkpoint | None:
@@ -276,13 +242,10 @@ class TrainingState:
             place = set_aside(checkpoint)
             print(f"warning: {error}; it was set aside as {place.name} and the one before it is used", flush=True)
 
-        check_epoch(
-            self.job.run, self.job.epoch
-        )  # a rank that was frozen until now must not delete its successor's work
-        sweep(self.job.run)
-        return newest_checkpoint(
-            self.job.run, chosen=self.job.checkpoint, chosen_since=self.job.job_epoch, damaged=damaged
-        )
+        job = self.job
+        check_epoch(job.run, job.epoch)  # a rank that was frozen until now must not delete its successor's work
+        sweep(job.run)
+        return newest_checkpoint(job.run, chosen=job.checkpoint, chosen_since=job.job_epoch, damaged=damaged)
 
     def load(self, checkpoint: Checkpoint) -> None:
         """Load the state of ``checkpoint``. Raises UserError if it does not fit."""
@@ -305,8 +268,8 @@ class TrainingState:
     def _changed(self, checkpoint: Checkpoint) -> set[str]:
         """The algorithm's settings that differ from those of ``checkpoint``, or that this job sets and that one did not."""
         there, here = (json.loads(json.dumps(facts)) for facts in (checkpoint.manifest, self.facts))
-        given = (f"train.{section_of(here['algorithm'])}", "settings")
-        pairs = [(setting_at(there, key) or {}, setting_at(here, key) or {}) for key in given]
+        keys = f"train.{section_of(here['algorithm'])}", "settings"
+        pairs = [(setting_at(there, key) or {}, setting_at(here, key) or {}) for key in keys]
         return {name for old, new in pairs for name in new if old.get(name) != new[name]}
 
     def _check_fit(self, checkpoint: Checkpoint) -> None:
@@ -320,11 +283,9 @@ class TrainingState:
             for key in getattr(self.task.config, "may_change", ()):
                 (facts["train"].get("config") or {}).pop(key, None)
         settings = [f"settings.{key}" for key in fixed_settings(self.algorithm.config_type, there["settings"])]
-        difference = first_difference(there, here, ["task", "algorithm", "train.seed", "train.config", *settings])
-        if difference:
-            ours = difference[0] in settings
+        if difference := first_difference(there, here, ["task", "algorithm", "train.seed", "train.config", *settings]):
             key, old, new = innermost(*difference)
-            if ours:  # its name in a job's YAML
+            if difference[0] in settings:  # its name in a job's YAML
                 key = f"{section_of(there['algorithm'])}.{key.removeprefix('settings.')}"
             raise UserError(
                 f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {key} is {old!r} there and {new!r} "
@@ -333,10 +294,11 @@ class TrainingState:
         then, now = (contract_from(facts, checkpoint.name) for facts in (there, here))
         accept = bool(self.job.section.get("accept_changed_robot"))
         changes = check_robots(then, self.task, f"checkpoint {checkpoint.name}", accept=accept)
-        if self.gang.is_main and changes:
-            print(f"warning: {changes}", flush=True)
-        if self.gang.is_main and then and now and (lines := differences(then, now, ranges=True)):
-            print(f"warning: the task changed since checkpoint {checkpoint.name}: {brief(lines)}", flush=True)
+        if self.gang.is_main:
+            if changes:
+                print(f"warning: {changes}", flush=True)
+            if then and now and (lines := differences(then, now, ranges=True)):
+                print(f"warning: the task changed since checkpoint {checkpoint.name}: {brief(lines)}", flush=True)
 
     def _load_worlds(self, checkpoint: Checkpoint) -> None:
         total, bounds = checkpoint.manifest["worlds"], checkpoint.manifest["shards"]
@@ -358,5 +320,7 @@ class TrainingState:
             raise UserError(f"checkpoint {checkpoint.name}: {error}") from error
 
 
+_IN_MANIFEST = ("reward", "score", "score_error", "score_episodes", "episode_length", "env_steps")
+"""Fields of :class:`Progress` that a manifest has."""
 _OF_ALGORITHM = "algorithm/"
 """Prefix of the names of an algorithm's per-world state."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from shared_store.volume.checkpoints import (
     Checkpoint,
@@ -20,41 +22,54 @@ if TYPE_CHECKING:
     from worker.learning.distributed import Gang
 
 
-def choose_checkpoint(gang: Gang, run: Run, wanted: int | str | None) -> Checkpoint:
+def choose_checkpoint(gang: Gang, run: Run, choice: int | str | None) -> Checkpoint:
     """The checkpoint for a user's choice: an iteration, a name, ``best``, or ``latest`` or None for the newest good one. All ranks call it.
 
     Raises UserError if it does not exist or is damaged; the message lists the existing ones.
     """
-    name, problem = None, ""
-    if gang.is_main:
-        try:
-            name = find_checkpoint(run, wanted).name
-        except (UserError, DamagedCheckpoint) as error:
-            problem = str(error)
-    if problem := gang.tell(problem) or "":
+    errors = UserError, DamagedCheckpoint
+    chosen, problem = chosen_by_main(gang, run.checkpoints, lambda: find_checkpoint(run, choice), errors)
+    if problem:
         raise UserError(problem)
-    # the other ranks list nothing: on a network volume they may not see the newest checkpoint in the directory yet
-    chosen = checkpoint_called(run.checkpoints, gang.tell(name) or "")
     assert chosen is not None
     return chosen
 
 
-def find_checkpoint(run: Run, wanted: int | str | None) -> Checkpoint:
+def chosen_by_main(
+    gang: Gang, folder: Path, choose: Callable[[], Checkpoint | None], errors: tuple[type[Exception], ...]
+) -> tuple[Checkpoint | None, str]:
+    """The checkpoint in ``folder`` that the main rank chooses, and the message if it raised one of ``errors``. All ranks call it.
+
+    The other ranks list nothing: on a network volume they may not see the newest checkpoint in the directory yet.
+    """
+    name, problem = None, ""
+    if gang.is_main:
+        try:
+            found = choose()
+            name = found.name if found else None
+        except errors as error:
+            problem = str(error)
+    if problem := gang.tell(problem) or "":
+        return None, problem
+    return checkpoint_called(folder, gang.tell(name) or ""), ""
+
+
+def find_checkpoint(run: Run, choice: int | str | None) -> Checkpoint:
     """As :func:`choose_checkpoint`, for one process. Of two with the same iteration, the later epoch wins."""
     checkpoints = list_checkpoints(run)
-    if wanted == "best":
+    if choice == "best":
         if (best := best_checkpoint(run)) is None:
             raise UserError(f"run {run.name} has no best checkpoint yet: evaluate two of them, or name an iteration")
-        wanted = best.name
-    if wanted in (None, "latest"):
+        choice = best.name
+    if choice in (None, "latest"):
         newest = newest_checkpoint(run)
         if newest is None:
             raise UserError(f"run {run.name} has no checkpoint that can be read in {run.checkpoints}; train it first")
         return newest
-    found = [c for c in checkpoints if wanted == c.name or (str(wanted).isdecimal() and int(wanted) == c.iteration)]
+    found = [c for c in checkpoints if choice == c.name or (str(choice).isdecimal() and int(choice) == c.iteration)]
     if not found:
-        there = ", ".join(str(c.iteration) for c in checkpoints) or "none"
-        raise UserError(f"run {run.name} has no checkpoint {wanted}; there are: {there}")
+        iterations = ", ".join(str(c.iteration) for c in checkpoints) or "none"
+        raise UserError(f"run {run.name} has no checkpoint {choice}; there are: {iterations}")
     found[-1].verify()
     return found[-1]
 
@@ -73,6 +88,7 @@ def load_policies(checkpoint: Checkpoint, device: str, count: int) -> list[Polic
     """:func:`load_policy`, several times: each remembers its own episodes."""
     from worker.learning.algorithms import find_algorithm, refusal
     from worker.learning.setup import spaces_from
+    from worker.learning.shards import read_file
 
     facts = checkpoint.manifest
     if "algorithm" not in facts:
@@ -88,16 +104,9 @@ def load_policies(checkpoint: Checkpoint, device: str, count: int) -> list[Polic
             f"checkpoint {checkpoint.name}: algorithm {facts['algorithm']} refuses what it was trained with: {refused}"
         ) from error
     try:
-        learnt = load_learner(checkpoint, device)["algorithm"]["policy"]
+        learnt = read_file(checkpoint, "learner.pt", device)["algorithm"]["policy"]
         for policy in policies:
             policy.load_state_dict(learnt)
     except (RuntimeError, KeyError) as error:
         raise UserError(f"checkpoint {checkpoint.name}: its policy can't be read: {error}") from error
     return policies
-
-
-def load_learner(checkpoint: Checkpoint, device: str = "cpu") -> dict[str, Any]:
-    """The content of ``learner.pt``. Raises UserError if it holds more than tensors and plain values."""
-    from worker.learning.shards import read_file
-
-    return read_file(checkpoint, "learner.pt", device)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 from shared_store.volume.metrics import THIS_RUN
@@ -24,11 +23,11 @@ STUCK = 20
 DEAD = 0.01
 """Standard deviation of the actions below which nothing is explored."""
 HISTORY = 2000
-"""Records of earlier attempts that are looked at, spread evenly."""
+"""Number of records of earlier attempts that are read, spread evenly."""
 
 
 class Watch:
-    """Looks at the records of a run in order.
+    """Watches the records of a run, in order.
 
     Args:
         iterations: Iteration at which the training ends.
@@ -40,15 +39,13 @@ class Watch:
         self._window: deque[tuple[float, float]] = deque(maxlen=WINDOW)
         self._first: float | None = None
         self._best, self._best_at = -math.inf, 0
-        self._checks = [_Check(PATIENCE, self._fallen), _Check(0, self._dead), _Check(STUCK, self._stuck)]
+        self._checks = (self._fallen, PATIENCE), (self._dead, 0), (self._stuck, STUCK)
+        """Conditions, and the iterations for which each must hold."""
+        self._since = [0] * len(self._checks)
+        """The first iteration of those in which each has held without a break; 0: it does not hold."""
 
-    def follow(self, history: Iterable[Mapping[str, Any]]) -> None:
-        """Take in the records of earlier attempts."""
-        for record in history:
-            self.look(record)
-
-    def look(self, record: Mapping[str, Any]) -> list[str]:
-        """What is wrong after the iteration of ``record``, a line each; empty as a rule."""
+    def warnings(self, record: Mapping[str, Any]) -> list[str]:
+        """The problems after the iteration of ``record``, a line each; usually none."""
         reward, episodes = record.get("reward"), record.get("episodes") or 0
         if episodes and _is_finite(reward):
             self._window.append((float(episodes), float(reward or 0.0)))
@@ -57,8 +54,12 @@ class Watch:
             self._first = mean if self._first is None else self._first
             if mean > self._best:
                 self._best, self._best_at = mean, record["iteration"]
-        found = [check.after(record) for check in self._checks]
-        if record["iteration"] == self._iterations:
+        iteration, found = record["iteration"], []
+        for number, (check, patience) in enumerate(self._checks):
+            text = check(record)
+            self._since[number] = (self._since[number] or iteration) if text else 0
+            found.append(text if iteration - self._since[number] >= patience else "")
+        if iteration == self._iterations:
             found[0] = self._ended()
         return [text for text in found if text]
 
@@ -112,20 +113,6 @@ class Watch:
             f"its steps are too large: KL {kl:.3f} is over desired_kl {target:g} with the learning rate on its floor of {least:g}; "
             "lower learning_rate_limits, or raise min_std"
         )
-
-
-@dataclass
-class _Check:
-    """A condition that must hold for some iterations."""
-
-    patience: int
-    check: Callable[[Mapping[str, Any]], str]
-    since: int | None = None
-
-    def after(self, record: Mapping[str, Any]) -> str:
-        text, iteration = self.check(record), record["iteration"]
-        self.since = None if not text else iteration if self.since is None else self.since
-        return text if self.since is not None and iteration - self.since >= self.patience else ""
 
 
 def _is_finite(value: Any) -> bool:

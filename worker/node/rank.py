@@ -53,7 +53,7 @@ class Rank:
         self.stalled: str | None = None
         """Its stacks when it had made no progress for too long."""
         self.progress: dict[str, Any] = {}
-        """The newest of everything that it told (:mod:`worker.learning.beacon`)."""
+        """The newest of everything that it told (:class:`worker.learning.reporter.Beacon`)."""
         self.heard: float | None = None
         """Time of its last message about an iteration (monotonic [s]); None before the first and after the last iteration."""
         self.spoke = time.monotonic()

@@ -14,12 +14,12 @@ from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.initial_weights import parent_checkpoint
 from shared_store.volume.layout import Store
 from tests.support.worker.clones import make_clone
+from tests.support.worker.plain_ppo import PlainPPO
 from tests.support.worker.point_task import Point
 from tests.support.worker.ranks import training
 from tests.support.worker.runs import assert_same_bits, last, runner, tensors, train
 from worker.learning.algorithms import installed
 from worker.learning.loop import Loop
-from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo.fused import PPO
 from worker.settings.errors import UserError
 
@@ -32,7 +32,7 @@ KINDS: dict[str, dict[str, Any]] = {
     "ppo": {},
     "sac": {"algorithm": "sac", "sac": SMALL_SAC},
     "rsl_rl": {"algorithm": "rsl_rl", "rsl_rl": SMALL_RSL},
-    "own": {"algorithm": "worker.learning.plain_ppo:PlainPPO", "settings": {"hidden_sizes": [8], "steps": 8}},
+    "own": {"algorithm": "tests.support.worker.plain_ppo:PlainPPO", "settings": {"hidden_sizes": [8], "steps": 8}},
 }
 """The training of each kind of algorithm."""
 
@@ -163,14 +163,14 @@ def begin(store: Path, task: Any = Point, **settings: Any) -> Loop:
         (
             "ppo",
             KINDS["own"],
-            r"fit this job: policy\.std is not there; they are of algorithm ppo, and worker\..*:PlainPPO does not",
+            r"fit this job: policy\.std is not there; they are of algorithm ppo, and tests\..*:PlainPPO does not",
         ),
         (
             "ppo",
             KINDS["rsl_rl"],
             "are of algorithm ppo, which rsl_rl can't read; set train.algorithm: ppo, or a module",
         ),
-        ("own", {}, r"fit this job: policy\.\S+ is not there; they are of algorithm worker\.\S+, and ppo "),
+        ("own", {}, r"fit this job: policy\.\S+ is not there; they are of algorithm tests\.\S+, and ppo "),
     ],
 )
 def test_weights_that_do_not_fit_are_refused_in_one_line(

@@ -40,7 +40,7 @@ PUPIL_RUN: dict[str, Any] = {
     **{"num_steps_per_env": 8, "algorithm": {"class_name": "Distillation", "gradient_length": 4}},
     **{"student": NETWORK, "teacher": NETWORK, "teacher_checkpoint": "rsl"},
 }
-OWN = "worker.learning.plain_ppo:PlainPPO"
+OWN = "tests.support.worker.plain_ppo:PlainPPO"
 
 
 def mirror(env: Any, obs: Any, actions: Any) -> tuple[Any, Any]:

@@ -186,10 +186,10 @@ TESTS = {
             "learning/distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
             "evaluation/evaluation.py": "evaluate",
             "evaluation/final_evaluation.py": "FinalEvaluation.trained",
-            "learning/earlier_settings.py": "as_begun",
+            "learning/training.py": "as_begun",
             "learning/exchange.py": "Exchange.gather",
             "learning/leaving.py": "train",
-            "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._build Loop._iterate Loop.train",
+            "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._iterate Loop.train",
             "learning/ppo/fused.py": "PPO.__init__ PPO._learn PPO.learn",
             "learning/setup.py": "build_algorithm build_task load_kernels",
             "learning/state.py": "TrainingState.finish",
@@ -198,26 +198,23 @@ TESTS = {
         "an_evaluation_has_the_episodes_of_all_ranks_in_every_round": {
             "evaluate.py": "main main.<locals>.build",
             "evaluation/episodes.py": "_gather play",
-            "learning/trained.py": "choose_checkpoint",
+            "learning/trained.py": "choose_checkpoint chosen_by_main",
         },
         "episodes_are_played_until_the_last_one_of_any_rank_has_ended": {"evaluation/episodes.py": "_one_round"},
         "a_request_to_leave_that_one_rank_has_got_ends_all_with_a_checkpoint": {"learning/loop.py": "Loop._handle"},
         "a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read": {"learning/state.py": "TrainingState.restore"},
-        "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/adoption.py": "adopt"},
-        "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/teacher.py": "_learnt give_teacher"},
+        "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/initial_weights.py": "adopt"},
+        "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/initial_weights.py": "load_teacher"},
         "worlds_that_do_not_fit_are_refused_by_all_ranks": {
             "learning/memory_estimate.py": "_taken measure within_memory"
         },
         "worlds_drawn_at_random_are_built_anew_for_the_evaluation": {
             "evaluation/final_evaluation.py": "held_out_worlds"
         },
-        "a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop": {"learning/completion.py": "complete"},
+        "a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop": {"learning/leaving.py": "complete"},
         "a_loss_that_is_not_finite_ends_all_ranks_after_their_saves": {"learning/loop.py": "Loop._failure"},
         "too_many_resets_on_one_rank_end_all_after_it_has_written_why": {"learning/loop.py": "Loop._judge_resets"},
         "start_frames_follow_the_failures_of_all_ranks": {"learning/loop.py": "Loop._begin_iteration"},
-        "plain_ppo_learns_on_two_ranks_what_it_learns_on_one": {
-            "learning/plain_ppo.py": "Network.update_normalizer PlainPPO.__init__ PlainPPO._describe PlainPPO._estimate PlainPPO.learn"
-        },
         "sac_has_the_same_learner_and_metrics_on_all_ranks_and_each_its_own_worlds": {
             "learning/sac/learner.py": "Learner.__init__",
             "learning/sac/sac.py": "SAC.__init__ SAC._observe SAC._update",

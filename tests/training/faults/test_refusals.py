@@ -22,7 +22,7 @@ from tests.support.worker.ranks import training
 from tests.support.worker.runs import runner, train
 from tests.support.worker.trained import run_in
 from worker.learning.loop import Loop
-from worker.learning.trained import load_learner
+from worker.learning.shards import read_file
 from worker.settings.errors import UserError
 
 
@@ -186,7 +186,7 @@ def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, na
     assert re.search(rf"{name} asks for \w+\.mkdir: only tensors and plain values", said)
     if name == "learner.pt":
         with pytest.raises(UserError, match="asks for"):  # as `muster export` and `evaluate` read it
-            load_learner(newest)
+            read_file(newest, "learner.pt")
     assert not (tmp_path / "executed").exists()
 
 

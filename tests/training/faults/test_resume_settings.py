@@ -42,7 +42,7 @@ def unchanged(store: Path) -> Loop:
 
 
 def objective(index: int) -> Callable[[PPO], float]:
-    return lambda ppo: ppo._head._objective._numbers[index]
+    return lambda ppo: ppo._head._numbers[index]
 
 
 APPLIED: dict[str, tuple[Any, Callable[[PPO], Any]]] = {

@@ -16,7 +16,7 @@ from shared_store.volume.layout import Run, Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.collectives import ALONE, TESTS, paths
 from tests.support.worker.gangs import Played, begun, case, digest, given, play_cases
-from tests.support.worker.loop import alone, iterate, setting_of
+from tests.support.worker.loop import alone, iterate
 from tests.support.worker.motion_task import Turning, motion
 from tests.support.worker.point_task import Point, PointConfig, PointPPO, Tripping
 from tests.support.worker.ranks import training
@@ -26,7 +26,6 @@ from worker.evaluation.episodes import play
 from worker.learning.algorithm import WorldShare
 from worker.learning.distributed import Gang
 from worker.learning.job import Job, StopRequest
-from worker.learning.plain_ppo import PlainPPO
 from worker.learning.ppo.fused import PPO
 from worker.learning.randomness import seed_generators
 
@@ -146,7 +145,7 @@ def test_episodes_are_played_until_the_last_one_of_any_rank_has_ended(told: list
 
 @case
 def an_evaluation_that_one_rank_is_asked_to_leave_ends_on_all(gang: Gang, store: Path) -> Any:
-    play([Point(PointConfig(episode_seconds=5.0), 3)], Still(), gang, is_asked_to_stop=lambda: gang.rank == 1)
+    play([Point(PointConfig(episode_seconds=5.0), 3)], Still(), gang, is_stop_requested=lambda: gang.rank == 1)
 
 
 def test_an_evaluation_that_one_rank_is_asked_to_leave_ends_on_all(told: list[Any]) -> None:
@@ -370,27 +369,6 @@ def test_start_frames_follow_the_failures_of_all_ranks(told: list[Any]) -> None:
 def dealt(gang: Gang) -> tuple[Point, WorldShare]:
     share = WorldShare.of(gang.rank, gang.size, WORLDS)
     return Point(PointConfig(), share.count, seed=2, first_world=share.first), share
-
-
-@case
-def plain_ppo_learns_on_two_ranks_what_it_learns_on_one(gang: Gang, store: Path) -> Any:
-    task, share = dealt(gang)
-    algorithm = PlainPPO(PointPPO(minibatches=4), setting_of(task, 1, gang, share))
-    metrics = iterate(algorithm, task, 0, 2)
-    weights = {name: tensor.tolist() for name, tensor in algorithm.policy().state_dict().items()}
-    return {"metrics": {name: float(value) for name, value in metrics.items()}, "weights": weights}
-
-
-def test_plain_ppo_learns_on_two_ranks_what_it_learns_on_one(told: list[Any]) -> None:
-    assert told[0] == told[1]
-    seed_generators(1, 0)
-    one = plain_ppo_learns_on_two_ranks_what_it_learns_on_one(alone(), Path())
-    for name, value in one["metrics"].items():
-        assert told[0]["metrics"][name] == pytest.approx(value, rel=1e-3, abs=1e-5), name
-    for name, weights in one["weights"].items():
-        torch.testing.assert_close(
-            torch.tensor(told[0]["weights"][name]), torch.tensor(weights), rtol=1e-3, atol=1e-5, msg=name
-        )
 
 
 @case

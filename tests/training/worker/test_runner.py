@@ -180,19 +180,6 @@ def test_a_finished_run_has_all_its_files(tmp_path: Path, capsys: pytest.Capture
     assert record["entropy"] == pytest.approx(1.4189 + torch.log(torch.tensor(record["action_std"])).item(), abs=0.02)
 
 
-def test_evaluation_leaves_the_worlds_as_they_were(tmp_path: Path) -> None:
-    from worker.evaluation.evaluation import evaluate
-
-    started = train(training(tmp_path, iterations=1))
-    before = started.task.state_dict()
-    results = [
-        evaluate(started.task, started.algorithm.policy(), started.gang, checkpoint="x", episodes=9) for _ in range(2)
-    ]
-    assert results[0].episodes == 16, "whole rounds of all 8 worlds"
-    assert results[0].mean_return == results[1].mean_return
-    assert all(torch.equal(tensor, before[name]) for name, tensor in started.task.state_dict().items())
-
-
 def test_a_save_that_the_volume_refuses_is_reported_and_training_goes_on(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -205,12 +192,12 @@ def test_a_save_that_the_volume_refuses_is_reported_and_training_goes_on(
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
     ended = training(tmp_path, iterations=4, epoch=2)
     stop = StopRequest()
-    monkeypatch.setattr("worker.learning.completion.sleep", lambda _: setattr(stop, "requested", True))
+    monkeypatch.setattr("worker.learning.leaving.sleep", lambda _: setattr(stop, "requested", True))
     with pytest.raises(TrainingError, match="its last checkpoint could not be saved"):
         train_with_obstacle(ended, obstacles[1], stop)
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3]
     obstacles[1].unlink()
-    monkeypatch.setattr("worker.learning.completion.sleep", lambda _: obstacles[1].unlink(missing_ok=True))
+    monkeypatch.setattr("worker.learning.leaving.sleep", lambda _: obstacles[1].unlink(missing_ok=True))
     train_with_obstacle(ended, obstacles[1])
     assert "its last checkpoint is not saved yet; trying again in 1 s" in capsys.readouterr().out
     assert [c.iteration for c in list_checkpoints(run)] == [1, 3, 4]
@@ -236,9 +223,6 @@ def test_a_newer_attempt_stops_this_one(tmp_path: Path) -> None:
     [
         ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: there is no such setting; did you mean learning_rate?"),
         ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; algorithm rsl_rl has it"),
-        ({"ppo": {"steps": 1.5}}, "train.ppo.steps: expected a whole number, found a number (1.5)"),
-        ({"ppo": {"normalize_observations": 1}}, "train.ppo.normalize_observations: expected true or false, found a "),
-        ({"ppo": {"hidden_sizes": []}}, "train.ppo.hidden_sizes: expected at least one number, found []"),
         ({"ppo": {"learning_rate": "fast"}}, "train.ppo.learning_rate: expected a number, found a text ('fast')"),
     ],
 )
@@ -250,13 +234,6 @@ def configured(section: dict[str, Any]) -> tuple[Any, Any]:
     """The task's configuration and PPO's settings of a job."""
     config = configure(Point, section)
     return config, algorithms.settings(PPO, "ppo", config, section)
-
-
-def test_right_overrides_are_taken() -> None:
-    section = {"ppo": {"learning_rate": 1, "hidden_sizes": [8, 8]}, "config": {"limit": 2}}
-    config, ppo = configured(section)
-    assert ppo.learning_rate == 1.0 and ppo.hidden_sizes == (8, 8) and config.limit == 2.0
-    assert ppo.steps == 8, "the task's own"
 
 
 @pytest.mark.parametrize(

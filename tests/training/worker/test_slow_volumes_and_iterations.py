@@ -111,7 +111,7 @@ def test_a_stop_in_a_long_iteration_loses_that_iteration_alone(tmp_path: Path, r
     started = [start_rank(body, rank, ranks, port, {**env, "MUSTER_GRACE_SECONDS": "2"}) for rank in range(ranks)]
     outputs = stopped_after(started, 2)
     assert [rank.returncode for rank in started] == [75] * ranks, outputs
-    assert "asked to stop: iteration 3 did not end within 1.6 s and was left; checkpoint 00000002-e1 stands" in outputs
+    assert "stop requested: iteration 3 did not end within 1.6 s and was left; checkpoint 00000002-e1 stands" in outputs
     (newest,) = list_checkpoints(Store(tmp_path).run("stopped"))
     assert not newest.is_scheduled, "the job asked for none before iteration 100"
     if ranks == 1:  # what goes on from it ends with the bits of a run that was never stopped

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,6 +16,7 @@ import warp
 from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
 from tests.support.worker.loop import alone
+from tests.support.worker.plain_ppo import PlainPPO
 from tests.support.worker.point_task import Point, PointConfig
 from worker.learning import algorithms
 from worker.learning.algorithm import WorldShare
@@ -32,8 +31,7 @@ from worker.learning.algorithms import (
 )
 from worker.learning.distributed import Gang
 from worker.learning.job import Job
-from worker.learning.plain_ppo import PlainPPO
-from worker.learning.ppo import draws, objective
+from worker.learning.ppo import draws, heads
 from worker.learning.sac import kernels
 from worker.learning.setup import build_algorithm, load_kernels
 from worker.settings.errors import UserError
@@ -116,7 +114,7 @@ class InTurn(Gang):
         self.turn = None
 
 
-@pytest.mark.parametrize(("name", "modules"), [("ppo", (draws, objective)), ("sac", (kernels,)), ("rsl_rl", ())])
+@pytest.mark.parametrize(("name", "modules"), [("ppo", (draws, heads)), ("sac", (kernels,)), ("rsl_rl", ())])
 def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algorithm(
     monkeypatch: pytest.MonkeyPatch, name: str, modules: tuple[Any, ...]
 ) -> None:
@@ -124,32 +122,6 @@ def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algori
     monkeypatch.setattr(warp, "load_module", lambda module, device: loaded.append((module, device, gang.turn)))
     load_kernels(find_algorithm(name), gang)
     assert loaded == [(module, "cpu", "algorithm") for module in modules]
-
-
-def reached(module: str, found: dict[str, Path]) -> dict[str, Path]:
-    """The worker's modules that are imported with this one, by their statements outside of functions."""
-    path = REPOSITORY / module.replace(".", "/")
-    file = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-    if module in found or not file.exists():
-        return found
-    found[module] = file
-    statements = ast.parse(file.read_text()).body
-    imports = [each for each in statements if isinstance(each, ast.Import | ast.ImportFrom)]
-    names = [alias.name for each in imports if isinstance(each, ast.Import) for alias in each.names]
-    for each in imports:
-        if isinstance(each, ast.ImportFrom) and each.module:
-            names += [each.module, *(f"{each.module}.{alias.name}" for alias in each.names)]
-    for name in (*names, module.rpartition(".")[0]):
-        if name.startswith("worker."):
-            reached(name, found)
-    return found
-
-
-def test_the_common_modules_import_no_algorithm() -> None:
-    found = reached("worker.learning.setup", {})
-    assert {"worker.learning.job", "worker.learning.algorithms"} <= found.keys()
-    assert not {name.partition(":")[0] for name in installed().values()} & found.keys()
-    assert reached("worker.learning.ppo.fused", {}).keys() >= {"worker.learning.ppo.draws"}, "it follows imports"
 
 
 ENVIRONMENT = {"MUSTER_STORE": "/store", "MUSTER_RUN": "run"}
@@ -185,6 +157,11 @@ def test_a_name_of_no_algorithm_is_refused_with_those_that_there_are(name: str) 
     assert refusal(find_algorithm, name, error=UserError) == (
         f"train.algorithm: no algorithm is called {name!r}; known: ppo, rsl_rl, sac, and module:Class of your own"
     )
+
+
+def test_a_class_of_an_earlier_version_is_refused_with_its_replacement() -> None:
+    with pytest.raises(UserError, match=r"PlainPPO is no longer part of Muster; .*: set train.algorithm: ppo, with"):
+        find_algorithm("worker.learning.plain_ppo:PlainPPO")
 
 
 def test_an_uninstalled_source_tree_has_its_own_algorithms(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,8 +15,8 @@ import torch.distributed as dist
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from worker.learning.distributed import Gang, RankPlacement
+from worker.learning.initial_weights import load_teacher
 from worker.learning.job import Job
-from worker.learning.teacher import give_teacher
 from worker.learning.trained import choose_checkpoint
 from worker.settings.errors import UserError
 
@@ -64,7 +64,7 @@ def test_every_rank_takes_the_teacher_from_where_the_main_rank_found_it(
     job = Job({}, store, run, 1, 1, "job", None, None, {})
     pupils = [Pupil(reference) for _ in gangs]
     for gang, pupil in zip(gangs, pupils, strict=True):
-        give_teacher(job, gang, pupil, None)
+        load_teacher(job, gang, pupil, None)
     assert [pupil.learnt for pupil in pupils] == [{"weight": weight}] * 2
 
 

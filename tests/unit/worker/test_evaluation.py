@@ -13,7 +13,6 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 import torch
-from tensordict import TensorDict
 
 from shared_store.volume.evaluations import lines
 from shared_store.volume.files import write_json
@@ -21,17 +20,13 @@ from shared_store.volume.layout import Run, Store
 from shared_store.volume.paired_episodes import are_paired, paired
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.worker.loop import alone
-from worker.evaluation.blocks import SIZE, Blocks
 from worker.evaluation.episodes import Episodes, Stopped, play
-from worker.evaluation.evaluation import best_words, result_of
+from worker.evaluation.evaluation import best_line, result_of, write_table
 from worker.evaluation.statistics import Sample, difference, share
-from worker.evaluation.table import write_table
-from worker.learning.randomness import held_out_seed
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks import terms
 from worker.tasks.declare.declaration import Declaration, Metric
 from worker.tasks.library.cartpole import Cartpole
-from worker.tasks.run.episode_records import LastEpisodes
 
 GANG = alone()
 
@@ -136,28 +131,9 @@ def test_a_success_is_a_metric_above_0_in_the_last_step_or_a_termination(task: C
     assert float(moving.term("metric_speed")[0]) == pytest.approx(total / length, rel=1e-5)
 
 
-def test_a_success_that_names_nothing_is_refused_and_a_task_without_terminations_has_none() -> None:
-    with pytest.raises(ValueError, match=r"success: no metric and no termination is called sped; did you mean speed\?"):
-        judged("sped").sketch(config())
-    flags, causes = torch.zeros(1, dtype=torch.bool), torch.zeros(1, dtype=torch.int32)
-    names = ["time_out", "physics_failed", "terminated"]
-    without = LastEpisodes(torch.zeros(1, 2), causes, flags, names, [], None, False)
-    assert not without.says_success and without.meaning == "the task does not say"
-
-
 def test_a_stopped_evaluation_records_nothing() -> None:
     with pytest.raises(Stopped):
-        play([Cartpole(config(), 2, seed=3)], Push(0.0), GANG, is_asked_to_stop=lambda: True)
-
-
-def test_blocks_of_worlds_have_policies_of_their_own() -> None:
-    policies = [Push(), Push(0.5)]
-    blocks = Blocks(policies)
-    seen = TensorDict({"policy": torch.full((2 * SIZE, 4), 1.0)}, [2 * SIZE])
-    assert blocks.act(seen).flatten().tolist() == [1.0] * SIZE + [0.5] * SIZE
-    blocks.reset()
-    blocks.reset(torch.ones(2 * SIZE, dtype=torch.bool))
-    assert [policy.resets for policy in policies] == [1, 1]
+        play([Cartpole(config(), 2, seed=3)], Push(0.0), GANG, is_stop_requested=lambda: True)
 
 
 @pytest.fixture(scope="module")
@@ -216,18 +192,6 @@ def test_returns_of_other_rewards_are_not_compared(task: Cartpole, played: Episo
     assert again["compared"]["name"] == "00000003-e1-own-job"
 
 
-def test_a_table_that_is_moved_says_what_it_is_of(task: Cartpole, played: Episodes, tmp_path: Path) -> None:
-    run = Run(tmp_path / "taught")
-    summary = result_of(task, played, "00000003-e1", 7, 0.0).write(run, "job", config={})
-    known = {
-        key.decode(): value.decode()
-        for key, value in pyarrow.parquet.read_schema(run.evaluations / summary["table"]).metadata.items()
-    }
-    assert (known["run"], known["checkpoint"], known["task"]) == ("taught", "00000003-e1", "Cartpole")
-    config = json.loads(known["config"])
-    assert config["control_hz"] == 60.0 and config["rewards"] == dict(task.config.rewards)
-
-
 def test_an_evaluation_is_compared_with_the_newest_in_the_same_episodes(
     task: Cartpole, played: Episodes, tmp_path: Path
 ) -> None:
@@ -239,11 +203,6 @@ def test_an_evaluation_is_compared_with_the_newest_in_the_same_episodes(
     assert compared["name"] == "00000020-e1-one" and compared["return"]["method"] == "paired"
     summary = result_of(task, played, "00000040-e1", 11, 0.0).write(run, "five", config={})
     assert summary["compared"]["name"] == "00000040-e1-four", "without a partner, with the newest"
-
-
-def test_the_seed_of_an_evaluation_is_a_number_of_every_reader() -> None:
-    seeds = [held_out_seed(seed) for seed in range(1000)]
-    assert all(seed == int(float(seed)) < 2**53 for seed in seeds) and len({*seeds}) == 1000
 
 
 def test_a_killed_evaluation_leaves_no_partial_table_and_the_next_one_deletes_its_leftovers(
@@ -269,10 +228,10 @@ def test_the_end_of_a_training_names_the_best_checkpoint_once_there_is_one_to_co
     add_run(store, "taught")
     run, figures = store.run("taught"), {"mean_length": 9.0, "max_length": 10, "episodes": 4, "time": 1.0}
     for iteration, mean in ((3, 7.25), (6, 5.0)):
-        assert best_words(run) == ""
+        assert best_line(run) == ""
         name = add_checkpoint(store, "taught", iteration).name
         write_json(run.evaluations / f"{name}.json", {**figures, "mean_return": mean})
-    assert best_words(run) == f"best of 2 checkpoints that are evaluated: {run.name}@3, mean return 7.25"
+    assert best_line(run) == f"best of 2 checkpoints that are evaluated: {run.name}@3, mean return 7.25"
 
 
 def test_the_interval_of_a_mean_is_student_s() -> None:

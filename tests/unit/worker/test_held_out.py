@@ -18,7 +18,7 @@ from worker.evaluation.evaluation import evaluate
 from worker.evaluation.final_evaluation import held_out_worlds
 from worker.learning.job import Job, StopRequest
 from worker.learning.loop import Loop
-from worker.learning.state import Progress
+from worker.learning.state import EndedEpisodes, Progress
 from worker.learning.training import Training
 from worker.tasks.library.cartpole import Cartpole
 
@@ -27,7 +27,7 @@ def scores(iterations: list[tuple[int, float]], **settings: int) -> list[float |
     """The score after each iteration of 10 steps, of (episodes that ended, their mean return)."""
     progress, found = Progress(), []
     for episodes, mean in iterations:
-        progress.count(10, episodes, episodes * mean, episodes * mean**2, **settings)
+        progress.count(EndedEpisodes(10, episodes, episodes * mean, episodes * mean**2), **settings)
         found.append(progress.score)
     return found
 
@@ -47,19 +47,13 @@ def test_a_score_covers_an_episode_of_each_world_and_a_hundred_in_all(
     assert scores(iterations, worlds=worlds, longest=longest) == pytest.approx(expected)
 
 
-def test_a_score_follows_the_newest_episodes_and_one_lucky_iteration_is_not_the_best() -> None:
-    steady = scores([(100, 10.0)] * 8 + [(1, 500.0)] + [(100, 10.0)] * 8, worlds=100, longest=40)
-    assert steady[7] == pytest.approx(10.0) and steady[16] == pytest.approx(10.0)
-    assert max(score for score in steady if score is not None) < 13.0
-    better = scores([(100, 10.0)] * 8 + [(100, 20.0)] * 4, worlds=100, longest=40)
-    assert better[-1] == pytest.approx(20.0)
-
-
 def test_a_score_has_a_standard_error(tmp_path: Path) -> None:
     returns = torch.randn(4, 75, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 3.0 + 800.0
     progress = Progress()
     for part in returns:
-        progress.count(10, len(part), float(part.sum()), float(part.square().sum()), worlds=200, longest=10)
+        progress.count(
+            EndedEpisodes(10, len(part), float(part.sum()), float(part.square().sum())), worlds=200, longest=10
+        )
     covered = returns[1:].flatten()  # the newest iterations that have an episode of each world
     assert progress.score_episodes == 225 and progress.score == pytest.approx(float(covered.mean()))
     assert progress.score_error == pytest.approx(float(covered.std()) / 225**0.5, rel=1e-6)
@@ -69,11 +63,11 @@ def test_a_score_with_old_records_without_squares_has_no_error_until_they_expire
     progress = Progress(recent=[[10, 100, 100.0]])  # as Muster saved it before
     found = []
     for _ in range(3):
-        progress.count(10, 100, 100.0, 100.0, worlds=100, longest=20)
+        progress.count(EndedEpisodes(10, 100, 100.0, 100.0), worlds=100, longest=20)
         found.append((progress.score, progress.score_error))
     assert found == [(1.0, None), (1.0, 0.0), (1.0, 0.0)]
     for _ in range(1000):
-        progress.count(10, 50, 50.0, 50.0, worlds=100, longest=40)
+        progress.count(EndedEpisodes(10, 50, 50.0, 50.0), worlds=100, longest=40)
     assert len(progress.recent) == 4, "only what the score needs is kept"
 
 

@@ -19,8 +19,7 @@ from worker.learning.ppo.fused import PPO
 from worker.settings.errors import UserError, is_out_of_memory
 from worker.settings.rsl_rl import RslRlConfig
 from worker.settings.sac import SACConfig
-from worker.settings.task import Randomization
-from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
+from worker.tasks.library.cartpole import CartpoleConfig
 
 torch.set_num_threads(1)
 HERE = alone()
@@ -105,20 +104,3 @@ def test_a_batch_of_sac_is_measured_although_the_first_iteration_only_collects()
     # of each sample of a batch at least what goes through two critics of two layers of 64, and 51 atoms, with gradients
     assert many.fixed - few.fixed > 32_000 * 2 * (64 + 64 + 51) * 4
     assert few.world > 0.0
-
-
-def test_constant_memory_leaves_less_for_the_worlds() -> None:
-    told = memory_estimate._explain(Cartpole, 1000, HERE, 10_000_000, memory_estimate.Need(4.5e6, 9_000.0))
-    assert told.endswith("than the 0.0 GB that are free: about 0.0 GB. About 500 fit: set `worlds`")
-    told = memory_estimate._explain(Cartpole, 1000, HERE, 10_000_000, memory_estimate.Need(9e6, 9_000.0))
-    assert told.endswith("Not even one fits: set smaller networks or batches")
-
-
-def test_settings_that_cannot_be_are_the_users_error_here_too() -> None:
-    pushed = dataclasses.replace(CartpoleConfig(), randomize=Randomization(push_interval=1.0, push_velocity=1.0))
-    learner = PPO, CartpoleConfig().ppo
-    with (
-        pytest.raises(UserError, match="the robot is fixed"),
-        memory_estimate.within_memory(Cartpole, pushed, learner, 9000, HERE),
-    ):
-        pytest.fail("nothing is to be built")

@@ -3,32 +3,22 @@
 from __future__ import annotations
 
 import importlib
-import json
 import os
 import signal
 import subprocess
-import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
-import warp as wp
 from rsl_rl.models.mlp_model import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
-from scipy.spatial.transform import Rotation
 from tensordict import TensorDict
 
 from benchmarks import load, walking
-from benchmarks.peers import cases, conversion, environment, judging, run, table
-from benchmarks.peers.building import build_loop, limited
-from benchmarks.peers.inside.clock import Clock
+from benchmarks.peers import cases, conversion, table
+from benchmarks.peers.building import build_loop
 from benchmarks.processor import contradictions
-from benchmarks.stock import stock_runner
-from benchmarks.tasks import LOADED
-from worker.settings.ppo import PPOConfig
-from worker.tasks import find_task
 from worker.tasks.declare.interface import Action, Interface, Observation
 
 
@@ -70,36 +60,6 @@ def test_the_table_says_when_muster_was_as_good_as_a_peer() -> None:
     assert table.reached(own[:2], theirs["rows"][-1]) is None
 
 
-def test_a_folder_without_records_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"there are no records in .*benchmarks\.peers\.muster"):
-        table.read_all(tmp_path)
-    (tmp_path / "muster.json").write_text(json.dumps({"peer": "muster"}))
-    with pytest.raises(ValueError, match=r"muster\.json is no record of a training: it has no case, limits"):
-        table.read_all(tmp_path)
-    (tmp_path / "muster.json").write_text("{")
-    with pytest.raises(ValueError, match="can't be read"):
-        table.read_all(tmp_path)
-    (tmp_path / "muster.json").write_text(json.dumps(record("muster", 10.0)))
-    assert table.read_all(tmp_path)[0][0]["rate"] == 10.0
-
-
-def test_a_rate_counts_what_follows_the_warm_iterations() -> None:
-    curve = [{"seconds": at, "env_steps": steps} for at, steps in ((50.0, 100), (60.0, 200), (65.0, 300), (70.0, 400))]
-    assert run.rate(curve, 2) == 200 / 10.0
-    assert run.rate(curve, 1) == 300 / 20.0
-    long = [{"seconds": float(number), "env_steps": number} for number in range(1, 1004)]
-    kept = run.thinned(long, 100)
-    assert len(kept) <= 101 and kept[-1] is long[-1] and kept[0]["env_steps"] == 11
-    assert run.thinned(curve) == curve
-
-
-def test_a_training_that_stopped_early_makes_no_record() -> None:
-    case = cases.find_case("go1")
-    options = run.options_of("mjlab", None, ["go1"]).parse_args(["--iterations", "5"])
-    with pytest.raises(ValueError, match="5 iterations were asked for, 3 are in its log"):
-        run.record_of("mjlab", case, options, {}, {"curve": record("mjlab", 1.0)["curve"]})
-
-
 def saved_actor(path: Path, observations: int = 7, actions: int = 3, normalized: bool = True) -> MLPModel:
     """An actor of rsl_rl that has met observations, and its checkpoint as rsl_rl writes it."""
     torch.manual_seed(3)
@@ -129,28 +89,6 @@ def test_a_converted_policy_acts_as_rsl_rl_says(tmp_path: Path, normalized: bool
     conversion.check_probe(policy, probe)
     with pytest.raises(ValueError, match=r"acts otherwise than the one that was trained: actions are 0\.1"):
         conversion.check_probe(policy, probe | {"actions": (expected + 0.1).tolist()})
-
-
-def test_files_other_than_policies_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "model.pt"
-
-    def refused(words: str, **options: str) -> None:
-        with pytest.raises(ValueError, match=words):
-            conversion.check_fit(conversion.read_rsl_rl(path, **options), 48, 12, "Go1Flat")
-
-    refused("there is no checkpoint")
-    path.write_bytes(b"no checkpoint")
-    refused("is no checkpoint of rsl_rl: ")
-    torch.save({"model_state_dict": {}}, path)
-    refused("it has no actor_state_dict, but model_state_dict")
-    torch.save({"actor_state_dict": {"rnn.weight": torch.zeros(1)}}, path)
-    refused(r"its actor is no plain network, it has rnn\.weight")
-    saved_actor(path)
-    refused("there is no activation 'elo'; did you mean elu", activation="elo")
-    refused("the policy sees 7 values, task Go1Flat has 48")
-    layers = [(torch.zeros(4, 2), torch.zeros(4)), (torch.zeros(1, 3), torch.zeros(1))]
-    with pytest.raises(ValueError, match="a layer of 4 outputs is followed by one of 3 inputs"):
-        conversion.PlainPolicy(layers, None, None)
 
 
 JOINTS = ("hip", "knee")
@@ -191,25 +129,6 @@ def test_a_policy_of_mjlab_fits_a_task_of_the_same_order_alone() -> None:
             conversion.check_contract(contract, own, "Own")
 
 
-def test_vectors_turn_back_as_rotation_matrices_say() -> None:
-    random = np.random.default_rng(5)
-    rotation, vectors = Rotation.random(20, rng=random), random.normal(size=(20, 3))
-    expected = np.einsum("nji,nj->ni", rotation.as_matrix(), vectors)
-    found = judging.rotate_back(torch.tensor(rotation.as_quat()), torch.tensor(vectors))
-    np.testing.assert_allclose(found.numpy(), expected, atol=1e-12)
-
-
-def test_a_task_has_the_limits_of_its_case() -> None:
-    ours, theirs = (cases.find_case("ant").limits(whose) for whose in ("ours", "theirs"))
-    loose, settings = limited("Ant", vars(ours))
-    assert settings == {} and loose.solver_options["iterations"] == 3
-    exact, _ = limited("Ant", vars(theirs))
-    assert (exact.solver_options["iterations"], exact.solver_options["tolerance"]) == (100, 1e-6)
-    assert exact.solver_options["njmax"] == loose.solver_options["njmax"] and exact.__name__ == "Ant"
-    _, settings = limited("Go1Flat", vars(cases.find_case("go1").ours))
-    assert settings == {"solver_iterations": 4, "solver_line_search": 8}
-
-
 def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration(tmp_path: Path) -> None:
     shared = cases.find_case("ant").shared("muster", "ours")
     asked = {**shared, "worlds": 2, "iterations": 1, "save_every": 1, "seed": 0, "steps": 4, "hidden_sizes": [8]}
@@ -224,24 +143,14 @@ def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration
     ("words", "said"),
     [
         ("muster --case g11", "there is no case 'g11'; did you mean g1?"),
-        ("muster --worlds 0", "--worlds 0: it is at least 1"),
         ("muster --iterations 10", "--iterations 10: of these 10 are not counted"),
-        ("muster --limits mine", "limits 'mine': there are theirs and ours"),
         ("muster --algorithm td3", "--algorithm td3: there are ppo and sac"),
-        ("rsl_rl --seed -1", "--seed -1: it is at least 0"),
         ("mjlab --case ant", "case ant: mjlab has no such task; its cases are go1, g1, go1-rough, g1-rough"),
         ("mjlab --environment nowhere", "there is no environment with nowhere/bin/python"),
-        ("isaaclab --frontend numpy", "--frontend numpy: there are torch and warp"),
         ("judge --out nowhere", "none of 0 records has checkpoints; train with --keep DIRECTORY"),
-        ("judge nowhere.json", "nowhere.json can't be read"),
         ("table --records nowhere", "there are no records in nowhere"),
         ("environment mjlabs", "there is no environment 'mjlabs'; did you mean mjlab?"),
-        ("environment mjlab --python nowhere", "nowhere is no Python that can be started"),
         ("walking --task Ant", "--task Ant: it follows no velocity commands; there are Go1Flat, G1Flat"),
-        ("walking --task G1Flatt", "did you mean G1Flat?"),
-        ("walking --algorithm td3", "--algorithm td3: there are sac and ppo"),
-        ("walking --every 0", "--every 0.0: it is more than 0"),
-        ("walking --length 98", "--length 98.0: it is a share of the longest episode"),
     ],
 )
 def test_invalid_options_of_the_commands_are_refused(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -250,60 +159,6 @@ def test_invalid_options_of_the_commands_are_refused(words: str, said: str, caps
     with pytest.raises(SystemExit) as ended:
         command.main(arguments)
     assert ended.value.code == 2 and said in capsys.readouterr().err
-
-
-def test_a_policy_walks_that_keeps_to_all_bounds() -> None:
-    bounds = walking.Bounds(length=0.9, linear=0.3, angular=0.4)
-    found = {"episodes": 4, "full_length": 1.0, "mean_return": 1.0, "judging_s": 1.0}
-    good = {"linear_error": 0.3, "angular_error": 0.4, "length_share": 0.9}
-    assert bounds.met(judging.Judgement(**found, **good))
-    for worse in ({"linear_error": 0.31}, {"angular_error": 0.41}, {"length_share": 0.89}):
-        assert not bounds.met(judging.Judgement(**found, **(good | worse)))
-
-
-def test_isaac_labs_robots_are_newtons_with_its_own_names(tmp_path: Path) -> None:
-    import newton.examples
-
-    packages = tmp_path / "lib" / "python3.12" / "site-packages" / "newton" / "examples"
-    packages.mkdir(parents=True)
-    (packages / "assets").symlink_to(Path(newton.examples.get_asset_directory()))
-    environment.put_robots(tmp_path)
-    folder = tmp_path / environment.ASSETS / "Isaac" / "Robots" / "IsaacSim"
-    assert (folder / "Ant" / "ant_instanceable.usd").read_bytes() == (packages / "assets" / "ant.usda").read_bytes()
-    from pxr import Usd, UsdPhysics
-
-    stage = Usd.Stage.Open(str(folder / "Humanoid" / "humanoid_instanceable.usd"))
-    joints = {prim.GetName() for prim in stage.Traverse() if prim.IsA(UsdPhysics.RevoluteJoint)}
-    assert {"pelvis", "right_shin", "left_shin", "right_lower_arm", "left_lower_arm"} <= joints
-    assert not joints & {"abdomen_x", "right_knee", "left_knee"}
-
-
-def test_the_clock_notes_what_rsl_rls_runner_does(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rsl_rl.runners import OnPolicyRunner
-    from rsl_rl.utils.logger import Logger
-
-    for owner, name in ((OnPolicyRunner, "learn"), (Logger, "log")):
-        monkeypatch.setattr(owner, name, getattr(owner, name))  # put back afterwards
-    task = find_task("Cartpole")
-    own = task(task.config_type(episode_seconds=0.1), 4)
-    clock = Clock(time.time() - 5.0, 4, 8, lambda: None)
-    clock.install()
-    runner = stock_runner(own, PPOConfig(steps=8, minibatches=2), str(tmp_path), save_interval=2)
-    runner.learn(4)
-    clock.write(str(tmp_path / "found.json"), where=tmp_path)
-    found = json.loads((tmp_path / "found.json").read_text())
-    assert clock.runner is runner and found["where"] == str(tmp_path)
-    assert found["startup_s"] >= 5.0
-    assert [point["env_steps"] for point in found["curve"]] == [32, 64, 96, 128]
-    times = [point["seconds"] for point in found["curve"]]
-    assert times == sorted(times) and all(
-        point["collect_s"] + point["learn_s"] <= after - before
-        for point, before, after in zip(found["curve"], [0.0, *times], times, strict=False)
-    )
-    assert found["curve"][-1]["episode_length"] <= own.max_episode_length
-    saved = [(Path(each["path"]).name, each["iteration"]) for each in found["checkpoints"]]
-    assert saved == [("model_0.pt", 1), ("model_2.pt", 3), ("model_3.pt", 4)]
-    assert conversion.read_rsl_rl(found["checkpoints"][-1]["path"]).actions == own.action_size
 
 
 BUSY = "while :; do :; done"
@@ -324,19 +179,6 @@ def test_a_machine_on_which_others_work_is_refused_or_marked(monkeypatch: pytest
     assert "loaded" not in load.told([{"others": 0.01, "load_average": 0.2}])
 
 
-def test_processes_started_by_a_benchmark_do_not_count_as_load() -> None:
-    before = load.own_seconds()
-    child = subprocess.Popen(["sh", "-c", f"sh -c '{BUSY}' & wait"], start_new_session=True)
-    try:
-        deadline = time.monotonic() + 60
-        while load.own_seconds() < before + 0.3:  # while it runs, and its child's child
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-    finally:
-        os.killpg(child.pid, signal.SIGKILL)
-        child.wait()
-
-
 def test_a_training_that_took_longer_than_its_rate_says_is_a_contradiction() -> None:
     rates = [{"task": "Cartpole", "worlds": 64, "train": 64_740.0, "stock": 30_140.0}]
     curve = [[9.2, 153_600, 27.3, 300.0]]
@@ -344,20 +186,3 @@ def test_a_training_that_took_longer_than_its_rate_says_is_a_contradiction() -> 
     theirs = {**ours, "stock": True, "seconds": 5.3}
     (line,) = contradictions(rates, [ours, theirs, {**ours, "worlds": 128}])
     assert line == "Cartpole with 64 worlds by Muster: 153,600 steps took 9.2 s, its rate says 2.4 s"
-
-
-def test_compile_times_are_read_from_what_warp_says(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(wp.config, "log_level", wp.LOG_INFO)  # a training in this process may have silenced it
-
-    @wp.kernel(module="unique")
-    def fill(values: wp.array[wp.float32]):
-        values[wp.tid()] = 2.0
-
-    values = wp.zeros(3, dtype=wp.float32, device="cpu")
-    started = time.perf_counter()
-    wp.launch(fill, dim=3, inputs=[values], device="cpu")
-    took = time.perf_counter() - started
-    [(module, milliseconds)] = LOADED.findall(capfd.readouterr().out)
-    assert "fill" in module and 0.0 < float(milliseconds) <= 1000.0 * took and values.numpy().tolist() == [2.0] * 3

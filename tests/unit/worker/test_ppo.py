@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -18,18 +19,17 @@ from tests.support.worker.loop import alone, iterate, transition_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.ppo import linear_layers as linear
-from worker.learning.ppo.fused import METRICS, PPO
-from worker.learning.ppo.loss import Clipping, Samples, categorical_terms, clipped_loss, gaussian_terms
-from worker.learning.ppo.objective import Objective
-from worker.learning.randomness import mix_seed
+from worker.learning.ppo.fused import PPO
+from worker.learning.ppo.heads import Gaussian
+from worker.learning.ppo.networks import build_actor
 from worker.settings.ppo import PPOConfig
 
 
-def make(worlds: int = 4, first: int = 0, total: int | None = None, *, plain: bool = False, **settings: object) -> PPO:
+def make(worlds: int = 4, first: int = 0, total: int | None = None, **settings: object) -> PPO:
     torch.manual_seed(5)
     share = WorldShare(first, worlds, total or worlds)
     spaces = Spaces({"policy": (2,), "critic": (2,)}, 1)
-    return PPO(dataclasses.replace(PointPPO(), **settings), LearningSetting(spaces, share, alone(), 1), plain=plain)
+    return PPO(dataclasses.replace(PointPPO(), **settings), LearningSetting(spaces, share, alone(), 1))
 
 
 def groups(observations: torch.Tensor) -> TensorDict:
@@ -84,42 +84,6 @@ def test_a_time_out_bootstraps_from_the_observation_after_the_step() -> None:
     assert ppo.rollout.returns.flatten().tolist() == pytest.approx([3.925, 4.5, 5.6])
 
 
-@pytest.mark.parametrize(
-    ("kl", "before", "after"),
-    [
-        (0.021, 3e-3, 2e-3),
-        (0.019, 3e-3, 3e-3),
-        (0.006, 3e-3, 3e-3),
-        (0.004, 3e-3, 4.5e-3),
-        (0.0, 3e-3, 3e-3),
-        (1.0, 1.2e-5, 1e-5),
-        (0.001, 9e-3, 1e-2),
-    ],
-)
-def test_learning_rate_rule(kl: float, before: float, after: float) -> None:
-    ppo = make(desired_kl=0.01)
-    ppo._rate.fill_(before)
-    ppo._adapt_learning_rate(torch.tensor(kl))
-    assert float(ppo._rate) == pytest.approx(after)
-    assert ppo.optimizer.param_groups[0]["lr"] is ppo._rate
-    fixed = make(schedule="fixed")
-    fixed._adapt_learning_rate(torch.tensor(1.0))
-    assert float(fixed._rate) == pytest.approx(1e-3)
-
-
-def test_the_greatest_rate_falls_after_its_horizon_and_takes_the_present_rate_along() -> None:
-    config = PPOConfig(learning_rate_limits=(1e-4, 1e-2), learning_rate_horizon=50)
-    rates = [config.greatest_rate(iteration) for iteration in (0, 49, 50, 99, 10**6)]
-    assert rates == pytest.approx([1e-2, 1e-2, 1e-2 * 50 / 51, 5e-3, 1e-4])
-    assert PPOConfig(learning_rate_horizon=None).greatest_rate(10**6) == 1e-2
-    ppo = make(learning_rate_horizon=50)
-    ppo._rate.fill_(8e-3)
-    ppo.begin(99)
-    assert float(ppo._rate) == pytest.approx(5e-3)
-    ppo._adapt_learning_rate(torch.tensor(1e-4))  # so small a KL asks for a greater rate
-    assert float(ppo._rate) == pytest.approx(5e-3)
-
-
 @pytest.mark.parametrize(("beyond", "within"), [(-0.001, 0.1), (0.05, 0.1), (3.0, 1.0), (0.5, 0.5)])
 def test_a_deviation_beyond_its_limits_comes_back_and_learns_again(beyond: float, within: float) -> None:
     """A clamp in the forward pass would have no gradient there: a deviation below its floor would be dead for ever."""
@@ -137,43 +101,6 @@ def test_a_deviation_beyond_its_limits_comes_back_and_learns_again(beyond: float
     std.data.fill_(beyond)
     ppo._head.project()
     assert std.tolist() == pytest.approx([within])
-
-
-def test_an_initial_deviation_outside_of_the_limits_widens_them() -> None:
-    assert PPOConfig().std_limits == (0.1, 1.0)
-    assert PPOConfig(init_std=0.05).std_limits == (0.05, 1.0)
-    assert PPOConfig(init_std=2.0).std_limits == (0.1, 2.0)
-    with pytest.raises(ValueError, match=r"min_std: expected at most max_std \(0.2\), got 0.3"):
-        PPOConfig(min_std=0.3, max_std=0.2)
-
-
-def test_normalisers_stay_as_they_are_after_their_horizon() -> None:
-    ppo, task = make(normalizer_horizon=2), Point(PointConfig(), 4)
-    iterate(ppo, task, 0, 2)
-    normalizer = ppo.actor.obs_normalizer
-    kept = {name: tensor.clone() for name, tensor in normalizer.state_dict().items()}
-    assert kept["count"] > 0
-    iterate(ppo, task, 2, 4)
-    assert all(torch.equal(tensor, kept[name]) for name, tensor in normalizer.state_dict().items())
-
-
-def test_metrics_of_a_rollout_by_hand() -> None:
-    """Rewards as in the test of the advantages: returns (1.9, 0, 5.6), values (1, 2, 3)."""
-    torch.manual_seed(5)
-    spaces = Spaces({"policy": (2,), "critic": (2,)}, 1)
-    setting = LearningSetting(spaces, WorldShare(0, 1, 1), alone(), 1, action_ranges=((-0.5, 2.0),))
-    ppo = PPO(dataclasses.replace(PointPPO(), **RETURNS, epochs=1), setting)
-    ppo.critic.mlp = FirstComponent()
-    play(ppo, VALUES, [1, 0, 2], [0, 1, 0], [0, 0, 0], torch.full((3, 2), float("nan")))
-    ppo.rollout.actions.copy_(torch.tensor([[[-0.51]], [[2.0]], [[2.1]]]))
-    ppo._normalize()
-    ppo._head.clipped.copy_(torch.tensor([0.0, 1.0, 1.0]))
-    ppo._gather_figures()
-    ppo._close()
-    found = dict(zip(METRICS, ppo._metrics.tolist(), strict=True))
-    # Var(A) = 10.82 / 3 of A = (0.9, -2, 2.6); Var(G) = (3.61 + 31.36 - 7.5^2 / 3) / 3 = 16.22 / 3
-    assert found["explained_variance"] == pytest.approx(1 - 10.82 / 16.22, abs=1e-4)
-    assert found["saturation"] == pytest.approx(2 / 3) and found["clip_fraction"] == pytest.approx(2 / 3)
 
 
 @pytest.mark.parametrize("device", [False, True])
@@ -224,15 +151,6 @@ def test_noise_is_normal_and_independent() -> None:
     assert float((noise.abs() > 2.0).float().mean()) == pytest.approx(0.0455, abs=0.01)
     for one, two in ((noise[1:], noise[:-1]), (noise[:, 1:], noise[:, :-1])):
         assert abs(float((one * two).mean())) < 0.03
-
-
-def test_shares_cover_all_worlds_once() -> None:
-    shares = [WorldShare.of(rank, 3, 8) for rank in range(3)]
-    assert [(share.first, share.count) for share in shares] == [(0, 2), (2, 3), (5, 3)]
-
-
-def test_seeds_differ() -> None:
-    assert len({mix_seed(1, 2), mix_seed(2, 1), mix_seed(1, 2, 0), mix_seed(12)}) == 4
 
 
 def stock_twin(ppo: PPO, config: PointPPO, worlds: int) -> StockPPO:
@@ -323,69 +241,48 @@ def test_gradients_of_a_layer_are_those_of_torch(missing: int) -> None:
 
 
 @pytest.mark.parametrize("clip_values", [True, False])
-def test_the_objective_and_its_gradient_are_those_of_torch_and_of_the_plain_loss(clip_values: bool) -> None:
+def test_the_loss_and_its_gradient_are_those_of_torch(clip_values: bool) -> None:
     """Far from the old policy too, where ratios and values are clipped on either side."""
     torch.manual_seed(3)
-    samples, actions, clip, value_coef, entropy_coef, weight = 500, 3, 0.2, 0.7, 0.02, 0.4
+    samples, actions, clip, weight = 500, 3, 0.2, 0.4
+    config = PPOConfig(clip=clip, clip_values=clip_values, value_loss_coef=0.7, entropy_coef=0.02)
     drawn, old_mean, mean = (0.7 * torch.randn(samples, actions) for _ in range(3))
     old_std, std = torch.tensor([0.9, 1.0, 1.2]), torch.tensor([1.0, 0.8, 1.3])
-    old_log_prob = Normal(old_mean, old_std).log_prob(drawn).sum(1)
     advantages, returns, old_values, values = (torch.randn(samples) for _ in range(4))
-    leaves = [each.requires_grad_() for each in (mean, std, values.unsqueeze(1))]
+    actor = build_actor(config, Spaces({"policy": (2,)}, actions))
+    actor.distribution.std_param.data.copy_(std)
+    head = Gaussian(actor, samples, weight, config)
+    head.std.copy_(old_std)
+    leaves = [mean.requires_grad_(), actor.distribution.std_param, values.unsqueeze(1).requires_grad_()]
+    order = torch.randperm(samples)
 
-    policy, value = Normal(mean, std), leaves[2][:, 0]
+    def rolled(each: torch.Tensor) -> torch.Tensor:
+        return each[order.argsort()].unsqueeze(1)
+
+    rollout = SimpleNamespace(actions=rolled(drawn), outputs=rolled(old_mean), advantages=rolled(advantages))
+    rollout.returns, rollout.values = rolled(returns), rolled(old_values)
+    old_log_prob = Normal(old_mean, old_std).log_prob(drawn).sum(1)
+    rollout.log_prob = head.log_prob(rollout)
+    torch.testing.assert_close(rollout.log_prob, rolled(old_log_prob))
+
+    policy, value = Normal(mean, leaves[1]), leaves[2][:, 0]
     ratio = (policy.log_prob(drawn).sum(1) - old_log_prob).exp()
     surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1 - clip, 1 + clip)).mean()
     near = old_values + (value - old_values).clamp(-clip, clip) if clip_values else value
     value_loss = torch.max((value - returns).square(), (near - returns).square()).mean()
     entropy = policy.entropy().sum(1).mean()
     kl = torch.distributions.kl_divergence(Normal(old_mean, old_std), policy).sum(1).mean()
-    loss = weight * (surrogate + value_coef * value_loss - entropy_coef * entropy)
+    loss = weight * (surrogate + 0.7 * value_loss - 0.02 * entropy)
     expected = [*torch.autograd.grad(loss, leaves), weight * torch.stack((surrogate, value_loss, entropy, kl)).detach()]
     assert (ratio < 1 - clip).any() and (ratio > 1 + clip).any()
 
-    settings = Clipping(clip, clip_values, value_coef, entropy_coef)
-    told = Samples(old_log_prob, advantages, returns, old_values)
-    plain, losses = clipped_loss(settings, told, *gaussian_terms(drawn, old_mean, old_std, mean, std), leaves[2][:, 0])
-    found = [*torch.autograd.grad(weight * plain, leaves), weight * losses]
-    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
-
-    order = torch.randperm(samples)
-    rollout = tuple(each[order.argsort()] for each in (drawn, old_mean, old_log_prob, advantages, returns, old_values))
-    objective = Objective(samples, actions, "cpu", weight=weight, settings=settings)
-    losses = objective.backward(order, rollout, old_std, *leaves)
+    losses = head.backward(order, rollout, mean, leaves[2])
     torch.testing.assert_close([*(each.grad for each in leaves), losses], expected, rtol=1e-4, atol=1e-6)
+    assert int(head.clipped.sum()) == int(((ratio - 1).abs() > clip).sum())
 
     mean.data[7, 0] = float("nan")
-    assert objective.backward(order, rollout, old_std, *leaves)[[0, 3]].isnan().all()
+    assert head.backward(order, rollout, mean, leaves[2])[[0, 3]].isnan().all()
     assert mean.grad[7].isnan().all()
-
-
-def test_choices_are_those_of_torch() -> None:
-    torch.manual_seed(6)
-    old, new = torch.randn(50, 5), torch.randn(50, 5)
-    choices = torch.randint(0, 5, (50, 1))
-    log_prob, entropy, kl = categorical_terms(choices.float(), old, new)
-    policy, before = (torch.distributions.Categorical(logits=each) for each in (new, old))
-    torch.testing.assert_close(log_prob, policy.log_prob(choices[:, 0]))
-    torch.testing.assert_close(entropy, policy.entropy())
-    torch.testing.assert_close(kl, torch.distributions.kl_divergence(before, policy))
-
-
-def played(ppo: PPO) -> dict[str, torch.Tensor]:
-    """The networks after some iterations on the point task."""
-    task = Point(PointConfig(), ppo.setting.share.count)
-    iterate(ppo, task, 0, 3)
-    return {**ppo.actor.state_dict(), **{f"critic.{name}": each for name, each in ppo.critic.state_dict().items()}}
-
-
-@pytest.mark.parametrize(
-    "settings", [{}, {"clip_values": False}, {"schedule": "fixed"}, {"critic_observations": "critic"}]
-)
-def test_whole_updates_are_those_of_the_plain_loss(settings: dict[str, object]) -> None:
-    fused, plain = played(make(**settings)), played(make(plain=True, **settings))
-    for name, tensor in fused.items():
-        torch.testing.assert_close(tensor, plain[name], rtol=1e-3, atol=1e-5, msg=name)
 
 
 def test_unsupported_settings_are_refused_by_name() -> None:

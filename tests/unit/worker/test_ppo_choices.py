@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch.distributions import Categorical
 
 from tests.support.worker.loop import alone
@@ -14,8 +13,8 @@ from tests.support.worker.point_task import PointPPO
 from worker.learning.algorithm import LearningSetting, Spaces, WorldShare
 from worker.learning.ppo.draws import Draws
 from worker.learning.ppo.fused import PPO
-from worker.learning.ppo.loss import Clipping, Samples, clipped_loss
-from worker.learning.ppo.networks import ActorPolicy, PixelModel, build_actor, build_critic
+from worker.learning.ppo.heads import Samples, clipped_loss
+from worker.learning.ppo.networks import build_actor
 from worker.settings.ppo import PPOConfig
 
 SMALL: dict[str, Any] = {"channels": (4, 6), "kernel_sizes": (3, 2), "strides": (2, 1), "hidden_sizes": (8,)}
@@ -63,27 +62,16 @@ def test_the_gradient_of_choices_is_that_of_torch_by_the_rows_of_the_minibatch()
     copies = [each.detach().clone().requires_grad_() for each in (outputs, values)]
     policy, old = Categorical(logits=copies[0]), Categorical(logits=rollout.outputs.flatten(0, 1)[rows])
     samples = [each.flatten()[rows] for each in (expected, rollout.advantages, rollout.returns, rollout.values)]
-    config = ppo.config
-    clipping = Clipping(config.clip, config.clip_values, config.value_loss_coef, config.entropy_coef)
     terms = (
         policy.log_prob(rollout.actions.flatten()[rows]),
         policy.entropy(),
         torch.distributions.kl_divergence(old, policy),
     )
-    loss, means = clipped_loss(clipping, Samples(*samples), *terms, copies[1][:, 0])
+    loss, means = clipped_loss(ppo.config, Samples(*samples), *terms, copies[1][:, 0])
     loss.backward()
     torch.testing.assert_close(losses, means)
     for mine, its in zip((outputs, values), copies, strict=True):
         torch.testing.assert_close(mine.grad, its.grad)
-
-
-def test_the_policy_of_choices_takes_the_likeliest_and_that_of_numbers_the_mean() -> None:
-    ppo = learner()
-    seen = TensorDict({"policy": torch.randn(6, 2)}, [6])
-    logits = ppo.actor.mlp(ppo.actor.get_latent(seen))
-    assert torch.equal(ppo.policy().act(seen), logits.argmax(1, keepdim=True).float())
-    means = ActorPolicy(ppo.actor, Spaces({"policy": (2,)}, 3)).act(seen)
-    assert torch.equal(means, logits)
 
 
 def test_a_state_brings_back_both_networks_and_the_rate_unless_the_job_sets_another() -> None:
@@ -100,23 +88,6 @@ def test_a_state_brings_back_both_networks_and_the_rate_unless_the_job_sets_anot
     assert learner(learning_rate=2e-3, schedule="fixed").load_state_dict(saved.state_dict()) == says
     assert learner(learning_rate=2e-3).load_state_dict(saved.state_dict(), changed={"gamma"}) == []
     assert learner(learning_rate=5e-4, schedule="fixed").load_state_dict(saved.state_dict()) == []
-
-
-def test_images_have_the_convolutions_of_the_settings_which_a_critic_of_the_same_images_shares() -> None:
-    config = PPOConfig(**SMALL)
-    actor = build_actor(config, IMAGES)
-    layers = [each for each in actor.modules() if isinstance(each, torch.nn.Conv2d)]
-    assert [(each.in_channels, each.out_channels, each.kernel_size[0], each.stride[0]) for each in layers] == [
-        (3, 4, 3, 2),
-        (4, 6, 2, 1),
-    ]
-    critic = build_critic(config, IMAGES, actor)
-    assert isinstance(critic, PixelModel) and isinstance(actor, PixelModel) and critic.cnns is actor.cnns
-    assert critic(IMAGES.example(2, "cpu")).shape == (2, 1)
-    numbers = build_critic(
-        PPOConfig(critic_observations="critic", **SMALL), Spaces({**IMAGES.observations, "critic": (4,)}, 2), actor
-    )
-    assert not isinstance(numbers, PixelModel) and numbers.mlp[0].in_features == 4
 
 
 def test_where_the_clock_cut_an_episode_of_images_its_future_is_the_value_of_the_image_before() -> None:

@@ -11,28 +11,10 @@ from tensordict import TensorDict
 from tests.support.worker.loop import alone, groups, iterate, transition_of
 from tests.support.worker.sac import SMALL, make, point
 from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
-from worker.learning.sac import kernels
 from worker.learning.sac.replay_buffer import ReplayBuffer
 from worker.learning.sac.sac import SAC
 
 torch.set_num_threads(1)
-
-
-def draw(first: int, worlds: int, key: int, uniform: bool = False, actions: int = 3) -> torch.Tensor:
-    """What is explored around a mean of 0.2 with a deviation of 0.5."""
-    drawn = torch.zeros(worlds, actions)
-    mean, log_std = torch.full_like(drawn, 0.2), torch.full_like(drawn, 0.5).log()
-    keys = torch.tensor([0, key], dtype=torch.int32)
-    kernels.explore(keys, 1, first, torch.tensor([int(uniform)], dtype=torch.int32), 2.0, mean, log_std, drawn)
-    return drawn
-
-
-def test_exploring_is_normal_noise_squashed_or_uniform() -> None:
-    noise = (torch.atanh(draw(0, 20_000, 7) / 2.0) - 0.2) / 0.5
-    assert noise.mean().abs() < 0.02 and (noise.std() - 1.0).abs() < 0.02
-    assert (noise[:, 0] * noise[:, 1]).mean().abs() < 0.02, "the components of an action are independent"
-    even = draw(0, 20_000, 7, uniform=True)
-    assert even.abs().max() < 2.0 and even.mean().abs() < 0.03 and (even.std() - 2.0 / 3.0**0.5).abs() < 0.02
 
 
 def test_actions_of_an_iteration_do_not_depend_on_the_ranks() -> None:
@@ -95,27 +77,6 @@ def test_only_what_is_there_is_drawn_and_all_of_it(n_step: int) -> None:
             assert torch.equal(begun.unique(), expected.float())
             found = replay.sample(rows).before[:, 0].unique()
             assert len(found) == len(expected) * worlds
-
-
-@pytest.mark.parametrize("n_step", [1, 2])
-def test_an_iterations_draws_exist_once_its_steps_are_written(n_step: int) -> None:
-    """Rows are drawn before the steps that overwrite the oldest ones; each row is read after them."""
-    task = point(3)
-    sac = make(task, replay_steps=10, n_step=n_step, batch_size=400, warm_up=0)
-    for iteration in range(8):
-        sac.replay.before[..., 0] = float("nan")  # what is read must have been written since
-        for each in range(iteration):
-            kept = torch.arange(4 * each, 4 * each + 4)[-10:]
-            sac.replay.before[kept % 10, :, 0] = kept.float().unsqueeze(1)
-        sac.begin(iteration)
-        for step in range(4):
-            task.step(sac.act(groups(task)))
-            sac.record(transition_of(task))
-            sac.replay.before[sac._slots[step], :, 0] = 4.0 * iteration + step
-        written = 4 * iteration + 4
-        begun = sac.replay.before[..., 0].flatten()[sac._all_rows]
-        assert torch.equal(begun.unique(), torch.arange(max(0, written - 10), written - n_step + 1).float())
-        sac.replay.advance(4)
 
 
 def by_loop(world: int, first: int, n: int, gamma: float, ends: torch.Tensor, time_outs: torch.Tensor) -> list[float]:

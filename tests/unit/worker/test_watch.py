@@ -27,7 +27,7 @@ def record(iteration: int, reward: float | None = None, **figures: Any) -> dict[
 
 
 def begun(of: Watch, returns: list[float]) -> list[list[str]]:
-    return [of.look(record(i, reward)) for i, reward in enumerate(returns, 1)]
+    return [of.warnings(record(i, reward)) for i, reward in enumerate(returns, 1)]
 
 
 RISE = [*([1.0] * 20), *([21.0] * 20)]
@@ -52,12 +52,6 @@ def test_a_fall_that_ends_in_time_or_that_noise_explains_is_not_reported() -> No
     assert not any(begun(watch(), noisy))
 
 
-def test_iterations_without_episodes_change_no_mean() -> None:
-    of = watch()
-    begun(of, RISE)
-    assert not any(of.look(record(i)) for i in range(41, 200))
-
-
 def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
     found = begun(watch(60), [*RISE, *([18.5] * 20)])
     assert not any(found[:-1])
@@ -71,7 +65,7 @@ def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
 
 @pytest.mark.parametrize(("deviation", "reported"), [(0.003, True), (0.05, False), (0.0, False), (None, False)])
 def test_a_dead_deviation_is_reported_at_once_and_choices_have_none(deviation: float | None, reported: bool) -> None:
-    found = watch().look(record(3, action_std=deviation))
+    found = watch().warnings(record(3, action_std=deviation))
     assert bool(found) == reported and all("0.003" in text and "min_std" in text for text in found)
 
 
@@ -88,7 +82,7 @@ def test_steps_that_stay_too_large_on_the_floor_of_the_rate_are_reported(
     rate: float, kl: float, schedule: str, reported: bool
 ) -> None:
     of = watch(schedule=schedule)
-    found = [of.look(record(i, learning_rate=rate, kl=kl)) for i in range(1, 30)]
+    found = [of.warnings(record(i, learning_rate=rate, kl=kl)) for i in range(1, 30)]
     assert [bool(texts) for texts in found] == [reported and i > 20 for i in range(1, 30)]
 
 

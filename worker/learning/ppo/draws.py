@@ -9,15 +9,16 @@ from __future__ import annotations
 import torch
 import warp as wp
 
+from worker.learning.parts import launch
 from worker.learning.randomness import mix_seed
-from worker.simulation.capture import on_torch_stream
 
 _ACTIONS, _ORDER = 0, 1
+wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
 def _stream(key: wp.array[wp.int32], what: int, world: int, number: int) -> wp.uint32:
-    """A generator of its own for each (iteration, purpose, world, number)."""
+    """A separate generator for each (iteration, purpose, world, number)."""
     return wp.rand_init(int(wp.rand_init(key[what], world)), number)
 
 
@@ -108,12 +109,12 @@ class Draws:
 
     def normal(self, step: int, mean: torch.Tensor, std: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Fill ``out`` with ``mean`` + ``std`` · normal noise, shapes (worlds, actions), (actions,), (worlds, actions)."""
-        self._launch(_draw_normal, tuple(mean.shape), [step, self._first], [mean, std, out])
+        launch(_draw_normal, mean.shape, (self._key, step, self._first, mean, std, out), self._device)
         return out
 
     def choices(self, step: int, logits: torch.Tensor, out: torch.Tensor) -> torch.Tensor:
         """Fill ``out``, shape (worlds, 1), with choices drawn by their ``logits``, shape (worlds, choices)."""
-        self._launch(_draw_choices, (len(logits),), [step, self._first], [logits, out])
+        launch(_draw_choices, len(logits), (self._key, step, self._first, logits, out), self._device)
         return out
 
     def order(self, orders: torch.Tensor, scratch: torch.Tensor) -> None:
@@ -125,9 +126,5 @@ class Draws:
             scratch: Shape (epochs, worlds, steps), int32.
         """
         epochs, worlds, _ = scratch.shape
-        self._launch(_draw_order, (epochs, worlds), [self._first, worlds, len(orders) // epochs], [scratch, orders])
-
-    def _launch(self, kernel: wp.Kernel, dim: tuple[int, ...], numbers: list[int], tensors: list[torch.Tensor]) -> None:
-        arrays = [wp.from_torch(each.detach(), return_ctype=True) for each in (self._key, *tensors)]
-        with on_torch_stream(self._device):
-            wp.launch(kernel, dim=dim, inputs=[arrays[0], *numbers, *arrays[1:]], device=self._device)
+        numbers = self._first, worlds, len(orders) // epochs
+        launch(_draw_order, (epochs, worlds), (self._key, *numbers, scratch, orders), self._device)

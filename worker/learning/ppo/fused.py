@@ -1,4 +1,4 @@
-"""The fused PPO over a gang of ranks, equal to the computation of one rank with all worlds, and made for CUDA graphs.
+"""The fused PPO, captured as CUDA graphs; a gang of ranks computes the same as one rank with all worlds.
 
 Networks are rsl-rl's. Differences from rsl-rl 5.5.1, with reasons:
 
@@ -9,8 +9,7 @@ Networks are rsl-rl's. Differences from rsl-rl 5.5.1, with reasons:
   Images are rendered only after the reset, so image tasks bootstrap from V(s_t), as rsl-rl does.
 - Values and log-probabilities are computed in one pass over the finished rollout, not step by step.
 - Every epoch draws new minibatches (rsl-rl draws once and repeats the same minibatches in all epochs).
-- The Gaussian's objective and its gradient are one kernel (:mod:`worker.learning.ppo.objective`), and on CUDA actor and critic run
-  side by side.
+- The Gaussian's objective and its gradient are one kernel (:mod:`worker.learning.ppo.heads`), and on CUDA actor and critic run side by side.
 - The learning rate is a tensor and its rule runs on the device. Nothing here waits for the device.
 """
 
@@ -25,24 +24,23 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDict
 
-from worker.learning import moments
 from worker.learning.algorithm import POLICY, LearningSetting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.optimizers import load_optimizer
-from worker.learning.ppo import draws, objective
+from worker.learning.observations import gather_moments, merge_moments
+from worker.learning.parts import Totals, keep_gradients, load_optimizer
+from worker.learning.ppo import draws, heads
 from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.draws import Draws
-from worker.learning.ppo.heads import Categorical, Gaussian, Head
-from worker.learning.ppo.loss import LOSSES, Clipping
-from worker.learning.ppo.networks import ActorPolicy, PixelModel, build_actor, build_critic
+from worker.learning.ppo.heads import LOSSES, Categorical, Gaussian
+from worker.learning.ppo.networks import ActorPolicy, build_actor, build_critic
 from worker.learning.ppo.rollout_buffer import GroupRollout, RolloutBuffer
-from worker.learning.totals import Totals
 from worker.settings.ppo import PPOConfig
 
 RATE_STEP = 1.5
 """rsl-rl's adaptive rule: divide the learning rate above 2 × the desired KL, multiply it below half, within its limits."""
 METRICS = (*LOSSES, "learning_rate", "action_std", "explained_variance", "clip_fraction", "gradient_norm", "saturation")
 """Names of an update's metrics; ``saturation`` only if some action has a range."""
+_ADVANTAGES = ("count", "advantages", "squared_advantages")
 
 
 class PPO:
@@ -50,10 +48,10 @@ class PPO:
 
     config_type: ClassVar[type[PPOConfig]] = PPOConfig
     captures_rollout: ClassVar[bool] = True
-    kernels: ClassVar[tuple[ModuleType, ...]] = (draws, objective)
+    kernels: ClassVar[tuple[ModuleType, ...]] = (draws, heads)
 
-    def __init__(self, config: PPOConfig, setting: LearningSetting, *, plain: bool = False) -> None:
-        """``plain``: compute the loss in plain torch instead of the kernel. Raises ValueError for unsupported settings."""
+    def __init__(self, config: PPOConfig, setting: LearningSetting) -> None:
+        """Raises ValueError for unsupported settings."""
         self.config, self.setting, self.gang = config, setting, setting.gang
         self.steps, self.device = config.steps, setting.gang.device
         spaces, worlds = setting.spaces, setting.share.count
@@ -72,29 +70,21 @@ class PPO:
         self._allocate_gradients()
         self._allocate_minibatches()
         weight = worlds / setting.share.total
-        clipping = Clipping(config.clip, config.clip_values, config.value_loss_coef, config.entropy_coef)
-        self._head: Head
-        if spaces.discrete:
-            self._head = Categorical(weight=weight, settings=clipping, device=self.device)
-        else:
-            samples = self._orders.shape[1] * worlds
-            self._head = Gaussian(
-                *(self.actor, spaces.actions, samples, self.device),
-                weight=weight,
-                settings=clipping,
-                limits=config.std_limits,
-                plain=plain,
-            )
-        self.graphs = self._record()
+        self._head = (
+            Categorical(weight, config, self.device)
+            if spaces.discrete
+            else Gaussian(self.actor, len(self._rows), weight, config)
+        )
+        self.graphs = self._make_graphs()
         for parameter in self._parameters:
             self.gang.broadcast(parameter.data)
 
     def _allocate_sums(self) -> None:
         """Buffer summed over the ranks before the minibatches: moments of the advantages, and sums of every observation normaliser."""
-        views = self.rollout.views
-        sizes = {view.group: 2 * view.latents.shape[-1] if self._is_normalised(view) else 0 for view in views}
-        self._sums = Totals({"count": 1, "advantages": 1, "squared_advantages": 1, **sizes}, self.device)
-        self._observation_sums = [self._sums[view.group] for view in views]
+        normalised = [view for view in self.rollout.views if getattr(view.model, "obs_normalization", False)]
+        sizes = {view.group: 2 * view.latents.shape[-1] for view in normalised}
+        self._sums = Totals({**dict.fromkeys(_ADVANTAGES, 1), **sizes}, self.device)
+        self._normalised = [(view, view.model.obs_normalizer, self._sums[view.group]) for view in normalised]
         figures = ("returns", "squared_returns", "clipped", "saturated")
         self._figures = Totals(dict.fromkeys(figures, 1), self.device)
         """Summed over the ranks after the minibatches, apart from the sums before: so their bits do not depend on the metrics."""
@@ -114,47 +104,41 @@ class PPO:
         sizes = [sum(linear.aligned(p.numel()) for p in part) for part in (actor, critic)]
         self._parameters = actor + critic
         self._shared = torch.zeros(sum(sizes) + len(LOSSES), device=self.device)
-        offset = 0
-        for parameter in self._parameters:
-            parameter.grad = self._shared[offset : offset + parameter.numel()].view_as(parameter)
-            offset += linear.aligned(parameter.numel())
-        self._gradients = self._shared[: sizes[0]], self._shared[sizes[0] : sum(sizes)]
-        self._losses = self._shared[sum(sizes) :]
+        keep_gradients(self._parameters, self._shared, linear.ALIGNED)
+        *gradients, self._losses = self._shared.split([*sizes, len(LOSSES)])
+        self._gradients = gradients
         self._rate = torch.tensor(self.config.learning_rate, device=self.device)
         self._greatest_rate = torch.tensor(self.config.greatest_rate(0), device=self.device)
         self._normalizer_learns = torch.ones((), dtype=torch.float64, device=self.device)
         options: dict[str, Any] = {"capturable": True} if self._side is not None else {}
+        kind: type[torch.optim.Adam] = torch.optim.Adam
         if self.config.optimizer == "adamw":
-            kind: type[torch.optim.Adam] = torch.optim.AdamW
-            options["weight_decay"] = self.config.weight_decay
-        else:
-            kind = torch.optim.Adam
+            kind, options["weight_decay"] = torch.optim.AdamW, self.config.weight_decay
         self.optimizer = kind(self._parameters, lr=self._rate, fused=True, **options)
 
     def _allocate_minibatches(self) -> None:
         """Allocate the samples of each minibatch and the metrics of an update."""
-        config, worlds = self.config, self.setting.share.count
+        config, worlds, device = self.config, self.setting.share.count, self.device
         share = self.steps // config.minibatches
-        count = config.epochs * config.minibatches
-        self._orders = torch.zeros(count, share, worlds, dtype=torch.long, device=self.device)
-        self._scratch = torch.zeros(config.epochs, worlds, self.steps, dtype=torch.int32, device=self.device)
-        self._rows = torch.zeros(share * worlds, dtype=torch.long, device=self.device)
-        self._ones = torch.ones(share * worlds, device=self.device)
-        self._loss_sums = torch.zeros(len(LOSSES), device=self.device)
-        self._squares = torch.zeros(2, device=self.device)
+        self._orders = torch.zeros(config.epochs * config.minibatches, share, worlds, dtype=torch.long, device=device)
+        self._scratch = torch.zeros(config.epochs, worlds, self.steps, dtype=torch.int32, device=device)
+        self._rows = torch.zeros(share * worlds, dtype=torch.long, device=device)
+        self._ones = torch.ones(share * worlds, device=device)
+        self._loss_sums = torch.zeros(len(LOSSES), device=device)
+        self._squares = torch.zeros(2, device=device)
         """Squared norms of the gradients of actor and critic."""
-        self._norm_sum = torch.zeros((), device=self.device)
-        self._metrics = torch.zeros(len(METRICS), device=self.device)
+        self._norm_sum = torch.zeros((), device=device)
+        self._metrics = torch.zeros(len(METRICS), device=device)
 
-    def _record(self) -> list[CudaGraphFunction]:
+    def _make_graphs(self) -> list[CudaGraphFunction]:
         """The parts of learning that the device replays as graphs: all of it, or in a gang the parts between the collectives."""
         parts = (self._estimate, self._normalize, self._compute_gradients, self._apply_gradients, self._close)
         if self.gang.size == 1:
             self._parts: tuple[Callable[[], None], ...] = parts
             return [CudaGraphFunction(self._learn, self.device, "learning")]
-        recorded = [CudaGraphFunction(part, self.device, part.__name__.strip("_").replace("_", " ")) for part in parts]
-        self._parts = tuple(recorded)
-        return recorded
+        graphs = [CudaGraphFunction(part, self.device, part.__name__.strip("_").replace("_", " ")) for part in parts]
+        self._parts = tuple(graphs)
+        return graphs
 
     # -- collecting ---------------------------------------------------------------------------------------------------
 
@@ -217,8 +201,7 @@ class PPO:
     @torch.no_grad()
     def _estimate(self) -> None:
         """Compute values, advantages and moments of this rank's samples, and draw the minibatches."""
-        rollout = self.rollout
-        critic = rollout.critic
+        rollout, critic = self.rollout, self.rollout.critic
         rollout.values.copy_(linear.forward(self.critic.mlp, critic.padded).squeeze(-1))
         last = self.critic.mlp(critic.latent(critic.last)).squeeze(-1)
         rollout.add_future(self.config.gamma, self.critic.mlp)
@@ -228,15 +211,14 @@ class PPO:
         self._sums["count"].fill_(advantages.numel())  # an assignment would copy from the host, which no graph holds
         self._sums["advantages"].copy_(advantages.sum(dtype=torch.float64))
         self._sums["squared_advantages"].copy_(advantages.double().square().sum())
-        for view, sums in zip(rollout.views, self._observation_sums, strict=True):
-            if len(sums):
-                moments.gather(view.observations, view.model.obs_normalizer, sums)
+        for view, normalizer, sums in self._normalised:
+            gather_moments(view.observations, normalizer, sums)
         self._draws.order(self._orders, self._scratch)
 
     @torch.no_grad()
     def _normalize(self) -> None:
         """Normalise the advantages with the moments of all ranks."""
-        count, total, squares = (self._sums[name][0] for name in ("count", "advantages", "squared_advantages"))
+        count, total, squares = (self._sums[name][0] for name in _ADVANTAGES)
         mean = total / count
         deviation = ((squares - total * mean) / (count - 1)).clamp(min=0.0).sqrt()
         self.rollout.advantages.sub_(mean).div_(deviation + 1e-8)
@@ -248,9 +230,9 @@ class PPO:
         self._shared.zero_()
         rollout = self.rollout
         latents = rollout.actor.batch(self._rows)
-        judged = latents if rollout.critic is rollout.actor else rollout.critic.batch(self._rows)
+        critic = latents if rollout.critic is rollout.actor else rollout.critic.batch(self._rows)
         with self._beside() as join:
-            values = linear.forward(self.critic.mlp, judged, self._ones)
+            values = linear.forward(self.critic.mlp, critic, self._ones)
         outputs = linear.forward(self.actor.mlp, latents, self._ones)
         join()
         self._losses.copy_(self._head.backward(self._rows, rollout, outputs, values))
@@ -282,11 +264,10 @@ class PPO:
     @torch.no_grad()
     def _close(self) -> None:
         """After the last minibatch: update the normalisers and gather the metrics."""
-        for view, sums in zip(self.rollout.views, self._observation_sums, strict=True):
-            if len(sums):
-                moments.merge(view.model.obs_normalizer, self._sums["count"][0], sums, self._normalizer_learns)
+        for _, normalizer, sums in self._normalised:
+            merge_moments(normalizer, self._sums["count"][0], sums, self._normalizer_learns)
         torch.div(self._loss_sums, len(self._orders), out=self._metrics[: len(LOSSES)])
-        count, total, squares = (self._sums[name][0] for name in ("count", "advantages", "squared_advantages"))
+        count, total, squares = (self._sums[name][0] for name in _ADVANTAGES)
         figures, updates = self._figures, len(self._orders)
         spread = figures["squared_returns"][0] - figures["returns"][0].square() / count
         unexplained = squares - total.square() / count  # a return less its value is the advantage
@@ -301,9 +282,6 @@ class PPO:
         )
         for metric, value in zip(self._metrics[len(LOSSES) :], found, strict=True):
             metric.copy_(value)
-
-    def _is_normalised(self, view: GroupRollout) -> bool:
-        return not isinstance(view.model, PixelModel) and bool(view.model.obs_normalization)
 
     @contextlib.contextmanager
     def _beside(self) -> Iterator[Callable[[], None]]:
@@ -357,10 +335,10 @@ class PPO:
         if weights_only:
             return []
         load_optimizer(self.optimizer, state["optimizer"])
-        saved, asked = float(state["learning_rate"]), self.config.learning_rate
+        saved, configured = float(state["learning_rate"]), self.config.learning_rate
         keeps = self.config.schedule == "adaptive" and "learning_rate" not in changed
-        self._rate.fill_(saved if keeps else asked)
-        return [] if keeps or saved == float(self._rate) else [f"learning rate set to {asked:g}"]
+        self._rate.fill_(saved if keeps else configured)
+        return [] if keeps or saved == float(self._rate) else [f"learning rate set to {configured:g}"]
 
     def world_state(self) -> dict[str, torch.Tensor]:
         """Empty: no state per world outlasts an iteration."""

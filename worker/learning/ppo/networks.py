@@ -16,7 +16,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
-from worker.learning.observations import made_up, to_numbers
+from worker.learning.observations import synthetic, to_numbers
 from worker.settings.ppo import PPOConfig
 
 
@@ -44,7 +44,7 @@ class ActorPolicy:
         return outputs.argmax(1, keepdim=True).to(torch.float32) if self._spaces.discrete else outputs
 
     def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """It remembers nothing."""
+        """No-op: the policy has no recurrent state."""
 
     def state_dict(self) -> dict[str, Any]:
         return dict(self.actor.state_dict())
@@ -55,8 +55,8 @@ class ActorPolicy:
     def module(self) -> ExportedPolicy:
         actor = copy.deepcopy(self.actor).cpu().eval()
         network = _Network(actor, self._spaces.discrete).eval()
-        seen = made_up({POLICY: self._spaces.observations[POLICY]}, getattr(actor, "obs_normalizer", None))
-        return ExportedPolicy(network, {"obs": seen[POLICY][:1]}, ["actions"], seen)
+        sample = synthetic({POLICY: self._spaces.observations[POLICY]}, getattr(actor, "obs_normalizer", None))
+        return ExportedPolicy(network, {"obs": sample[POLICY][:1]}, ["actions"], sample)
 
 
 class _Network(nn.Module):
@@ -64,25 +64,18 @@ class _Network(nn.Module):
 
     def __init__(self, actor: MLPModel | PixelModel, discrete: bool) -> None:
         super().__init__()
-        self.mlp, self._discrete = actor.mlp, discrete
-        if isinstance(actor, PixelModel):
-            self.before: nn.Module = nn.Sequential(_Numbers(), actor.cnns[POLICY])
-        else:
-            self.before = actor.obs_normalizer
+        self.mlp, self._discrete, self._sees_images = actor.mlp, discrete, isinstance(actor, PixelModel)
+        self.before = actor.cnns[POLICY] if isinstance(actor, PixelModel) else actor.obs_normalizer
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        outputs: torch.Tensor = self.mlp(self.before(obs))
+        outputs: torch.Tensor = self.mlp(self.before(to_numbers(obs) if self._sees_images else obs))
         return outputs.argmax(1, keepdim=True).to(torch.float32) if self._discrete else outputs
-
-
-class _Numbers(nn.Module):
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return to_numbers(obs)
 
 
 def build_actor(config: PPOConfig, spaces: Spaces) -> MLPModel | PixelModel:
     """A network for the group ``policy``. Its outputs are logits, or the mean of a Gaussian with a learnt standard deviation."""
-    example, common = spaces.example(1, "cpu"), _common(config, config.hidden_sizes)
+    example = spaces.example(1, "cpu")
+    common: dict[str, Any] = {"hidden_dims": config.hidden_sizes, "activation": config.activation}
     if not spaces.discrete:
         common["distribution_cfg"] = {"class_name": GaussianDistribution, "init_std": config.init_std}
     shape = spaces.observations[POLICY]
@@ -110,7 +103,9 @@ def build_critic(config: PPOConfig, spaces: Spaces, actor: MLPModel | PixelModel
         raise ValueError(
             f"critic_observations: the task has no group {group!r}; it has {', '.join(spaces.observations)}"
         )
-    example, common = spaces.example(1, "cpu"), _common(config, config.critic_hidden_sizes or config.hidden_sizes)
+    example = spaces.example(1, "cpu")
+    sizes = config.critic_hidden_sizes or config.hidden_sizes
+    common: dict[str, Any] = {"hidden_dims": sizes, "activation": config.activation}
     groups: dict[str, list[str]] = {"critic": [group]}
     if isinstance(actor, PixelModel) and group == POLICY:
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints that they are shared
@@ -123,10 +118,6 @@ def build_critic(config: PPOConfig, spaces: Spaces, actor: MLPModel | PixelModel
     if group == POLICY:
         critic.obs_normalizer = actor.obs_normalizer  # both see the same observations: keep one set of moments
     return critic
-
-
-def _common(config: PPOConfig, sizes: Sequence[int]) -> dict[str, Any]:
-    return {"hidden_dims": tuple(sizes), "activation": config.activation}
 
 
 def _check_layers(config: PPOConfig, shape: Sequence[int]) -> None:

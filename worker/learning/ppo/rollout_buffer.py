@@ -103,11 +103,11 @@ class RolloutBuffer:
             torch.addcmul(delta[step], decay[step], self.advantages[step + 1], out=self.advantages[step])
         torch.add(self.advantages, self.values, out=self.returns)
 
-    def add_future(self, gamma: float, judge: nn.Module) -> None:
+    def add_future(self, gamma: float, critic_mlp: nn.Module) -> None:
         """Where the clock cut an episode, its future is the value of the observation at the cut.
 
-        Images are not rendered after the step, so the value of the previous image replaces it, as in rsl-rl. ``judge`` maps latents to
-        values, shape (…, 1).
+        Images are not rendered after the step, so the value of the previous image replaces it, as in rsl-rl. ``critic_mlp`` maps
+        latents to values, shape (…, 1).
         """
         if self.terminal is None:
             self.rewards.addcmul_(self.time_outs, self.values, value=gamma)
@@ -116,9 +116,9 @@ class RolloutBuffer:
         if rewards.device.type == "cpu":  # may look, and seldom finds many
             rows = self.time_outs.flatten().nonzero().squeeze(1)
             if len(rows):
-                values = judge(critic.latent(self.terminal.flatten(0, 1)[rows])).squeeze(1)
+                values = critic_mlp(critic.latent(self.terminal.flatten(0, 1)[rows])).squeeze(1)
                 rewards.view(-1).index_add_(0, rows, values, alpha=gamma)
             return
-        values = judge(critic.latent(self.terminal)).squeeze(-1)
+        values = critic_mlp(critic.latent(self.terminal)).squeeze(-1)
         # the other rows may hold anything, NaN too
         rewards.add_(torch.where(self.time_outs > 0, values, torch.zeros_like(values)), alpha=gamma)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -19,18 +20,14 @@ from tensordict import TensorDict
 
 from worker.learning.algorithm import POLICY, LearningSetting, Policy, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
-from worker.learning.rsl import construction as building
+from worker.learning.rsl import construction
 from worker.learning.rsl.policy import RslRlPolicy
 from worker.learning.rsl.vector_environment import as_floats
 from worker.settings.rsl_rl import NETWORKS, RslRlConfig
 
 
 class RslRl:
-    """See :class:`worker.learning.algorithm.Algorithm`.
-
-    Attributes:
-        algorithm: rsl_rl's own object.
-    """
+    """See :class:`worker.learning.algorithm.Algorithm`."""
 
     config_type: ClassVar[Any] = RslRlConfig
     captures_rollout: ClassVar[bool] = False
@@ -40,7 +37,8 @@ class RslRl:
         self.steps = config.num_steps_per_env
         self.teacher_checkpoint = config.teacher_checkpoint
         self.graphs: Sequence[CudaGraphFunction] = ()
-        self.algorithm, seen, self._groups = building.build_algorithm(config, setting)
+        self.algorithm, groups, self._groups = construction.build_algorithm(config, setting)
+        """rsl_rl's own object."""
         self._gang, self._worlds, self._ranges = setting.gang, setting.share.count, setting.action_ranges
         self._networks = {
             name: getattr(self.algorithm, f"_raw_{name}", getattr(self.algorithm, name))
@@ -50,14 +48,14 @@ class RslRl:
         self._distils = isinstance(self.algorithm, Distillation)
         self._acting = f"{'student' if self._distils else 'actor'}_state_dict"
         self._curiosity = getattr(self.algorithm, "rnd", None)
-        self._asked_rate: float | None = config.algorithm.get("learning_rate")
+        self._configured_rate: float | None = config.algorithm.get("learning_rate")
         self._intrinsic = torch.zeros((), device=setting.gang.device)
-        self._policy = RslRlPolicy(self.algorithm.get_policy(), seen, setting.spaces)
+        self._policy = RslRlPolicy(self.algorithm.get_policy(), groups, setting.spaces)
         if self._distils and setting.rehearsal:
             self.algorithm.teacher_loaded = True  # weights don't affect the memory
         if setting.gang.size > 1:
             self.algorithm.broadcast_parameters()
-        self._begin_memories(building.example_of(setting.spaces, self._worlds, setting.gang.device))
+        self._begin_memories(construction.example_of(setting.spaces, self._worlds, setting.gang.device))
         self.algorithm.train_mode()
 
     # -- an iteration -------------------------------------------------------------------------------------------------
@@ -96,25 +94,21 @@ class RslRl:
             self.algorithm.compute_returns(as_floats(observations, self._groups))
             described = self._describe_rollout()
         losses = {name: float(value) for name, value in self.algorithm.update().items()}
-        device = self._gang.device
-        numbers = torch.tensor(list(losses.values()), device=device, dtype=torch.float64)
-        names, parts = [*losses, *described], [numbers, *described.values()]
+        number = partial(torch.tensor, device=self._gang.device, dtype=torch.float64)
+        own = dict(zip(losses, number([*losses.values()]), strict=True)) | described
         if self._curiosity:
-            names.append("intrinsic_reward")
-            parts.append(self._intrinsic.double().view(1) / self.steps)
+            own["intrinsic_reward"] = self._intrinsic.double() / self.steps
         if getattr(self.algorithm.get_policy(), "distribution", None) is not None:
-            names.append("action_std")
-            parts.append(self.algorithm.get_policy().output_std.detach().double().mean().view(1))
-        means = self._gang.sum(torch.cat(parts)) / self._gang.size
+            own["action_std"] = self.algorithm.get_policy().output_std.detach().double().mean()
+        means = self._gang.sum(torch.stack([*own.values()])) / self._gang.size
         self._share_statistics()
-        metrics = dict(zip(names, means, strict=True))
+        metrics = dict(zip(own, means, strict=True))
         if self._curiosity:
-            metrics["rnd_weight"] = torch.tensor(self._curiosity.weight, device=device, dtype=torch.float64)
-        metrics["learning_rate"] = torch.tensor(self.learning_rate, device=device, dtype=torch.float64)
-        return metrics
+            metrics["rnd_weight"] = number(self._curiosity.weight)
+        return {**metrics, "learning_rate": number(self.learning_rate)}
 
     def _describe_rollout(self) -> dict[str, torch.Tensor]:
-        """Figures of this rank's rollout, each of shape (1,), float64; none without a critic."""
+        """Figures of this rank's rollout, each of shape (), float64; none without a critic."""
         storage: Any = getattr(self.algorithm, "storage", None)
         if self._distils or not all(hasattr(storage, name) for name in ("returns", "values", "actions")):
             return {}
@@ -122,10 +116,10 @@ class RslRl:
         figures = {"explained_variance": 1.0 - errors.var() / returns.var().clamp(min=1e-12)}
         ranges = dict(item for item in enumerate(self._ranges) if item[1])
         if ranges:
-            taken = storage.actions[..., list(ranges)]
-            within = torch.clamp(taken, *torch.tensor([*ranges.values()], device=taken.device).t())
-            figures["saturation"] = (within != taken).double().mean()
-        return {name: value.view(1) for name, value in figures.items()}
+            actions = storage.actions[..., list(ranges)]
+            within = torch.clamp(actions, *torch.tensor([*ranges.values()], device=actions.device).t())
+            figures["saturation"] = (within != actions).double().mean()
+        return figures
 
     def _share_statistics(self) -> None:
         """Give all ranks the same running statistics.
@@ -179,7 +173,12 @@ class RslRl:
         saved = dict(self.algorithm.save())
         saved.pop(self._acting, None)
         curious = {"rnd_steps": self._curiosity.update_counter} if self._curiosity else {}
-        return {POLICY: self.algorithm.get_policy().state_dict(), **saved, **curious, "asked_rate": self._asked_rate}
+        return {
+            POLICY: self.algorithm.get_policy().state_dict(),
+            **saved,
+            **curious,
+            "asked_rate": self._configured_rate,
+        }
 
     def load_state_dict(
         self, state: Mapping[str, Any], *, weights_only: bool = False, changed: Collection[str] = ()
@@ -189,7 +188,7 @@ class RslRl:
         A learning rate that this job changes overrides the saved one, which may have adapted. Raises RuntimeError, ValueError or KeyError
         if the state does not fit.
         """
-        asked = self._asked_rate
+        rate = self._configured_rate
         saved = {name: value for name, value in state.items() if name not in (POLICY, "rnd_steps", "asked_rate")}
         saved[self._acting] = state[POLICY]
         if weights_only:
@@ -202,10 +201,10 @@ class RslRl:
         if self._curiosity:
             _count_on_host(self._curiosity.optimizer)
             self._curiosity.update_counter = int(state["rnd_steps"])
-        if asked is None or asked == state["asked_rate"]:
+        if rate is None or rate == state["asked_rate"]:
             return []
-        self.learning_rate = asked
-        return [f"learning rate set to {asked:g}"]
+        self.learning_rate = rate
+        return [f"learning rate set to {rate:g}"]
 
     def _begin_memories(self, example: TensorDict) -> None:
         """Allocate rsl_rl's state of each world, zeros, now instead of in the first step.
@@ -255,10 +254,10 @@ class RslRl:
     @classmethod
     def build_policy(cls, config: RslRlConfig, spaces: Spaces, device: str) -> Policy:
         """The actor, or the student, alone."""
-        _, names = building.algorithm_type(config)
-        example = building.example_of(spaces, 1, device)
-        sets = building.observation_sets(config, names, example)
-        model = building.build_network(config, names[0], sets, example, spaces.actions).to(device).eval()
+        _, names = construction.algorithm_type(config)
+        example = construction.example_of(spaces, 1, device)
+        sets = construction.observation_sets(config, names, example)
+        model = construction.build_network(config, names[0], sets, example, spaces.actions).to(device).eval()
         return RslRlPolicy(model, sets[names[0]], spaces)
 
 

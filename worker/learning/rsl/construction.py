@@ -10,11 +10,10 @@ import os
 import sys
 import warnings
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
-import torch
 from rsl_rl.algorithms import PPO, Distillation
-from rsl_rl.env import VecEnv
 from rsl_rl.utils import resolve_callable, resolve_class, resolve_obs_groups
 from tensordict import TensorDict
 from torch import nn
@@ -27,27 +26,13 @@ from worker.settings.rsl_rl import NETWORKS, RslRlConfig
 from worker.settings.rsl_rl_checks import check_gradient_length, check_networks
 
 
-class ConstructionEnvironment(VecEnv):
-    """The environment that rsl_rl needs to build an algorithm. A symmetry function receives it as ``env``."""
-
-    def __init__(self, setting: LearningSetting, example: TensorDict) -> None:
-        self.num_envs, self.num_actions = setting.share.count, setting.spaces.actions
-        self.device, self.step_dt = setting.gang.device, setting.control_seconds
-        self.cfg: dict[str, Any] = {}
-        self._example = example
-
-    @property
-    def unwrapped(self) -> ConstructionEnvironment:
-        """This object, since rsl_rl looks for ``step_dt`` behind wrappers."""
-        return self
-
-    def get_observations(self) -> TensorDict:
-        """Zeros, batch size (worlds,)."""
-        return self._example
-
-    def step(self, actions: torch.Tensor) -> Any:
-        """Unsupported: Muster steps the worlds."""
-        raise RuntimeError("rsl_rl's algorithms do not step Muster's worlds")
+def _environment(setting: LearningSetting, example: TensorDict) -> SimpleNamespace:
+    """The part of an environment that rsl_rl needs to build an algorithm; a symmetry function receives it as ``env``. It has no ``step``,
+    since Muster steps the worlds."""
+    env = SimpleNamespace(num_envs=setting.share.count, num_actions=setting.spaces.actions, cfg={})
+    env.device, env.step_dt, env.get_observations = setting.gang.device, setting.control_seconds, lambda: example
+    env.unwrapped = env  # rsl_rl looks for step_dt behind wrappers
+    return env
 
 
 def example_of(spaces: Spaces, worlds: int, device: str) -> TensorDict:
@@ -63,9 +48,11 @@ def algorithm_type(config: RslRlConfig) -> tuple[Any, tuple[str, str]]:
         if not hasattr(found, "construct_algorithm"):
             raise ValueError(f"{name} is not an algorithm: it has no construct_algorithm")
     distils = isinstance(found, type) and issubclass(found, Distillation)
-    given = {each: getattr(config, each) for each in NETWORKS}
-    with _named():
-        return found, check_networks(name, distils, given, config.teacher_checkpoint)
+    sections = {each: getattr(config, each) for each in NETWORKS}
+    try:
+        return found, check_networks(name, distils, sections, config.teacher_checkpoint)
+    except Refused as refused:
+        raise ValueError(f"rsl_rl.{refused}") from refused
 
 
 def observation_sets(config: RslRlConfig, names: tuple[str, str], example: TensorDict) -> dict[str, list[str]]:
@@ -115,7 +102,7 @@ def build_algorithm(config: RslRlConfig, setting: LearningSetting) -> tuple[Any,
     }
     try:
         with _quiet():
-            built = found.construct_algorithm(example, ConstructionEnvironment(setting, example), complete, gang.device)
+            built = found.construct_algorithm(example, _environment(setting, example), complete, gang.device)
     except Exception as error:
         for name in names if not is_out_of_memory(error) else ():  # was it one of them?
             try:
@@ -132,13 +119,13 @@ def build_algorithm(config: RslRlConfig, setting: LearningSetting) -> tuple[Any,
 def _check_numbers(found: Any, section: dict[str, Any]) -> None:
     """Refuse values other than numbers, and fractions for counts, which a user's class would only notice while it computes."""
     for name, parameter in inspect.signature(found).parameters.items():
-        default, given = parameter.default, section.get(name, parameter.default)
+        default, value = parameter.default, section.get(name, parameter.default)
         if not isinstance(default, int | float) or isinstance(default, bool):
             continue
         kind = int if isinstance(default, int) and name != "grad_reduce_bucket_mb" else int | float
-        if not isinstance(given, kind) or isinstance(given, bool):
+        if not isinstance(value, kind) or isinstance(value, bool):
             expected = "a whole number" if kind is int else "a number"
-            raise ValueError(f"rsl_rl.algorithm.{name}: expected {expected}, found {kind_of(given)}")
+            raise ValueError(f"rsl_rl.algorithm.{name}: expected {expected}, found {kind_of(value)}")
 
 
 def _check(built: Any, names: tuple[str, str], setting: LearningSetting, steps: int) -> None:
@@ -154,28 +141,26 @@ def _check(built: Any, names: tuple[str, str], setting: LearningSetting, steps: 
         if networks[0].distribution is None:
             raise ValueError("rsl_rl.actor.distribution_cfg: PPO needs a distribution to draw actions from")
         recurrent = any(network.is_recurrent for network in networks)
-        parts, there = built.num_mini_batches, worlds if recurrent else worlds * steps
-        if parts > there:
+        parts, available = built.num_mini_batches, worlds if recurrent else worlds * steps
+        if parts > available:
             what = "worlds, since a network is recurrent" if recurrent else "samples"
             raise ValueError(
-                f"rsl_rl.algorithm.num_mini_batches: {parts} minibatches need as many {what}; a rank has {there}"
+                f"rsl_rl.algorithm.num_mini_batches: {parts} minibatches need as many {what}; a rank has {available}"
             )
-        if built.symmetry:
-            _check_symmetry(built.symmetry.data_augmentation_func)
+        if built.symmetry:  # refuse a function that rsl_rl can't call
+            function = built.symmetry.data_augmentation_func
+            try:
+                inspect.signature(function).bind(env=None, obs=None, actions=None)
+            except (TypeError, ValueError) as error:
+                what = (
+                    f"{getattr(function, '__qualname__', type(function).__name__)} is called with env, obs and actions"
+                )
+                raise ValueError(f"rsl_rl.algorithm.symmetry_cfg.data_augmentation_func: {what}: {error}") from error
     if isinstance(built, Distillation):
-        with _named():
+        try:
             check_gradient_length(built.gradient_length, built.num_learning_epochs, steps)
-
-
-def _check_symmetry(function: Any) -> None:
-    """Refuse a function that rsl_rl can't call."""
-    try:
-        inspect.signature(function).bind(env=None, obs=None, actions=None)
-    except (TypeError, ValueError) as error:
-        name = getattr(function, "__qualname__", type(function).__name__)
-        raise ValueError(
-            f"rsl_rl.algorithm.symmetry_cfg.data_augmentation_func: {name} is called with env, obs and actions: {error}"
-        ) from error
+        except Refused as refused:
+            raise ValueError(f"rsl_rl.{refused}") from refused
 
 
 def _find(name: Any) -> Any:
@@ -191,15 +176,6 @@ def _quiet() -> Iterator[None]:
     with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
         warnings.filterwarnings("ignore", "optimizer contains a parameter group with duplicate parameters")
         yield
-
-
-@contextlib.contextmanager
-def _named() -> Iterator[None]:
-    """Prefix refusals in this context with ``rsl_rl``."""
-    try:
-        yield
-    except Refused as refused:
-        raise ValueError(f"rsl_rl.{refused}") from refused
 
 
 @contextlib.contextmanager

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import nn
 
 from worker.learning.algorithm import ExportedPolicy, Spaces
-from worker.learning.observations import made_up, to_numbers
+from worker.learning.observations import synthetic, to_numbers
 from worker.learning.rsl.vector_environment import as_floats
 
 
@@ -85,7 +85,7 @@ class RslRlPolicy:
             network=_OnnxModule(network, vectors, images).eval(),
             inputs={**inputs, **remembered},
             outputs=["actions", *(f"{name}_out" for name in remembered)],
-            sample=made_up(
+            sample=synthetic(
                 {group: self._spaces.observations[group] for group in self._groups}, self._model.obs_normalizer
             ),
         )

@@ -119,8 +119,8 @@ def as_floats(observations: Mapping[str, torch.Tensor] | TensorDict, groups: Ite
     Returns:
         float32, images from -0.5 to 0.5; batch size (worlds,).
     """
-    seen = {name: observations[name] for name in groups}
-    copies = {name: to_numbers(each) if each.dtype == torch.uint8 else each.clone() for name, each in seen.items()}
+    own = {name: observations[name] for name in groups}
+    copies = {name: to_numbers(each) if each.dtype == torch.uint8 else each.clone() for name, each in own.items()}
     first = next(iter(copies.values()))
     return TensorDict(copies, batch_size=first.shape[:1], device=first.device)
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import torch
 import warp as wp
 
-from worker.simulation.capture import on_torch_stream
+from worker.learning.parts import launch
 
 wp.set_module_options({"enable_backward": False})
 
@@ -115,26 +115,13 @@ def explore(
         log_std: Logarithm of its standard deviation, same shape.
         actions: Same shape.
     """
-    device = str(actions.device)
-    with on_torch_stream(device):
-        wp.launch(
-            _explore,
-            dim=len(actions),
-            inputs=[_array(keys), step, first_world, _array(uniform), limit, _array(mean), _array(log_std)],
-            outputs=[_array(actions)],
-            device=device,
-        )
+    arguments = keys, step, first_world, uniform, limit, mean, log_std, actions
+    launch(_explore, len(actions), arguments, str(actions.device))
 
 
 def look_ahead(
-    rows: torch.Tensor,
-    outcomes: torch.Tensor,
-    worlds: int,
-    powers: torch.Tensor,
-    last: torch.Tensor,
-    returns: torch.Tensor,
-    discounts: torch.Tensor,
-) -> None:
+    rows: torch.Tensor, outcomes: torch.Tensor, worlds: int, powers: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Ends, returns and discounts of transitions, from the replay's ring of steps.
 
     Args:
@@ -142,19 +129,13 @@ def look_ahead(
         outcomes: Reward, whether the episode continued, whether a future follows; shape (steps · worlds, 3), float32.
         worlds: Rows of one step.
         powers: Discounts of 0 to n steps, shape (n + 1,), float32.
-        last: Filled with the rows of their last steps, shape (samples,), int64.
-        returns: Filled with the discounted sums of their rewards, shape (samples,), float32.
-        discounts: Filled with the discount of the future, shape (samples,), float32.
+
+    Returns:
+        Rows of their last steps, int64, discounted sums of their rewards, and the discount of the future, float32; each (samples,).
     """
-    device = str(outcomes.device)
-    with on_torch_stream(device):
-        wp.launch(
-            _look_ahead,
-            dim=len(rows),
-            inputs=[_array(rows), _array(outcomes), worlds, _array(powers)],
-            outputs=[_array(last), _array(returns), _array(discounts)],
-            device=device,
-        )
+    last, (returns, discounts) = torch.empty_like(rows), powers.new_empty(2, len(rows))
+    launch(_look_ahead, len(rows), (rows, outcomes, worlds, powers, last, returns, discounts), str(rows.device))
+    return last, returns, discounts
 
 
 def project(
@@ -177,20 +158,7 @@ def project(
         greatest: The last atom.
         projected: Filled, and returned; shape (samples, atoms).
     """
-    device = str(projected.device)
-    read = (probabilities, returns, discounts, bonuses)
     gap = (greatest - least) / (projected.shape[1] - 1)
-    with on_torch_stream(device):
-        wp.launch(
-            _project,
-            dim=projected.shape,
-            inputs=[*map(_array, read), least, gap],
-            outputs=[_array(projected)],
-            device=device,
-        )
+    arguments = probabilities, returns, discounts, bonuses, least, gap, projected
+    launch(_project, projected.shape, arguments, str(projected.device))
     return projected
-
-
-def _array(tensor: torch.Tensor) -> object:
-    """The same memory as an array for Warp's kernels."""
-    return wp.from_torch(tensor.detach(), return_ctype=True)

@@ -12,7 +12,7 @@ from torch.nn.functional import log_softmax
 
 from worker.learning.algorithm import WorldShare
 from worker.learning.distributed import Gang
-from worker.learning.optimizers import load_optimizer
+from worker.learning.parts import keep_gradients, load_optimizer
 from worker.learning.sac import kernels
 from worker.learning.sac.networks import Critics, SquashedGaussianActor, make_normalizer
 from worker.learning.sac.replay_buffer import Batch
@@ -70,9 +70,7 @@ class Learner:
         losses = policy + 1
         self._shared = torch.zeros(losses + len(LOSSES) + critics, device=device)
         for offset, part in zip((0, policy, losses + len(LOSSES)), parts, strict=True):
-            for parameter in part:
-                parameter.grad = self._shared[offset : offset + parameter.numel()].view_as(parameter)
-                offset += parameter.numel()
+            keep_gradients(part, self._shared[offset:])
         self._policy_gradients = [each.grad for each in self._policy_parameters if each.grad is not None]
         self._critic_gradients = [each.grad for each in self._critic_parameters if each.grad is not None]
         self._policy_gradient, self._critic_gradient = self._shared[:policy], self._shared[-critics:]
@@ -82,23 +80,14 @@ class Learner:
         self._of_critics = self._shared[losses + LOSSES.index("critic_loss") :]
 
     def _make_optimizers(self, cuda: bool) -> None:
-        config = self.config
+        config, decay = self.config, self.config.weight_decay
         options: dict[str, Any] = {"betas": BETAS, "fused": True, "capturable": cuda}
-        decay = config.weight_decay
-        self._policy_optimizer = torch.optim.AdamW(
-            [
-                {"params": self._policy_parameters, "lr": config.actor_learning_rate, "weight_decay": decay},
-                {
-                    "params": self._temperature_parameters,
-                    "lr": config.temperature_learning_rate,
-                    "weight_decay": 0.0,
-                },
-            ],
-            **options,
-        )
-        self._critic_optimizer = torch.optim.AdamW(
-            self._critic_parameters, lr=config.critic_learning_rate, weight_decay=decay, **options
-        )
+        policy = {"params": self._policy_parameters, "lr": config.actor_learning_rate, "weight_decay": decay}
+        rate = config.temperature_learning_rate
+        temperature = {"params": self._temperature_parameters, "lr": rate, "weight_decay": 0.0}
+        critics = {"params": self._critic_parameters, "lr": config.critic_learning_rate, "weight_decay": decay}
+        self._policy_optimizer = torch.optim.AdamW([policy, temperature], **options)
+        self._critic_optimizer = torch.optim.AdamW([critics], **options)
 
     @property
     def temperature(self) -> torch.Tensor:
@@ -119,23 +108,27 @@ class Learner:
         """
         self.losses.zero_()
         share = 1.0 / self.config.batch_size  # the batch is all ranks' together
-        taken = batch.before[:, self.width :]
-        seen, known = self._normalize(batch.before)
-        seen_after, known_after = self._normalize(batch.after)
+        actions = batch.before[:, self.width :]
+        before, critics_before = self._normalize(batch.before)
+        after, critics_after = self._normalize(batch.after)
         temperature = self.temperature
         with torch.no_grad():
-            following, log_prob = self.actor.sample(seen_after, noise[0])
-            target = self.target(self.targets(known_after, following), batch, -temperature * log_prob)
+            following, log_prob = self.actor.sample(after, noise[0])
+            target = self.target(self.targets(critics_after, following), batch, -temperature * log_prob)
             if self.config.atoms > 1:
                 self.mass.add_(target[:, -1].sum(), alpha=share)
-        outputs = self.critics(known, taken)
-        critic_loss = self._critic_loss(outputs, target) * share
+        outputs = self.critics(critics_before, actions)
+        if self.config.atoms == 1:
+            error = (outputs - target).square().sum()
+        else:  # the cross entropy
+            error = -(target * log_softmax(outputs, -1)).sum()
+        critic_loss = error * share
         torch._foreach_copy_(self._critic_gradients, torch.autograd.grad(critic_loss, self._critic_parameters))
         self.losses[2].copy_(critic_loss.detach())
         self.losses[3].copy_(self.critics.mean(outputs.detach()).mean(0).sum() * share)
         if improves:
-            chosen, log_prob = self.actor.sample(seen, noise[1])
-            value = self.critics.combined_mean(self.critics(known, chosen))
+            chosen, log_prob = self.actor.sample(before, noise[1])
+            value = self.critics.combined_mean(self.critics(critics_before, chosen))
             policy_loss = (temperature * log_prob - value).sum() * share
             torch._foreach_copy_(self._policy_gradients, torch.autograd.grad(policy_loss, self._policy_parameters))
             entropy = -log_prob.detach()
@@ -165,12 +158,6 @@ class Learner:
         probabilities = self.targets.combined_distribution(outputs)
         ends = config.v_min, config.v_max
         return kernels.project(probabilities, batch.returns, batch.discounts, bonuses, *ends, self._projected)
-
-    def _critic_loss(self, outputs: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
-        """Sum over critics and samples of the cross entropy, or of the squared error."""
-        if self.config.atoms == 1:
-            return (outputs - target).square().sum()
-        return -(target * log_softmax(outputs, -1)).sum()
 
     @torch.no_grad()
     def apply(self, improves: bool) -> None:
@@ -215,5 +202,5 @@ class Learner:
         for name, optimizer in (("policy", self._policy_optimizer), ("critic", self._critic_optimizer)):
             if weights_only:
                 optimizer.state.clear()
-                continue
-            load_optimizer(optimizer, state[f"{name}_optimizer"])
+            else:
+                load_optimizer(optimizer, state[f"{name}_optimizer"])

@@ -5,8 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Sequence
 
 import torch
 from rsl_rl.modules.normalization import EmpiricalNormalization
@@ -15,7 +14,7 @@ from torch import nn
 from torch.nn.functional import softplus
 
 from worker.learning.algorithm import POLICY, ExportedPolicy, Spaces
-from worker.learning.observations import made_up
+from worker.learning.observations import synthetic
 from worker.settings.sac import LOG_STD, SACConfig
 
 HEAD_SCALE = 0.01
@@ -43,7 +42,7 @@ def hidden_layers(sizes: Sequence[int], layer_norm: bool) -> Iterator[nn.Module]
 
 
 class SquashedGaussianActor(nn.Module):
-    """A Gaussian, squashed into the action's limits by tanh (arXiv:1812.05905, appendix C), with its normaliser inside."""
+    """SAC's policy: a Gaussian, squashed into the action's limits by tanh (arXiv:1812.05905, appendix C), with its normaliser inside."""
 
     def __init__(self, config: SACConfig, observations: int, actions: int) -> None:
         super().__init__()
@@ -57,19 +56,12 @@ class SquashedGaussianActor(nn.Module):
             self.head.bias.zero_()
             self.head.bias[actions:] = math.atanh(2.0 * (math.log(config.init_std) - low) / (high - low) - 1.0)
 
-    def forward(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Mean and logarithm of the standard deviation, before squashing.
-
-        Args:
-            observations: Observations of the task, shape (n, observations), float32.
-
-        Returns:
-            Two tensors of shape (n, actions).
-        """
-        return self.spread(self.normalizer(observations))
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        """The best action, the squashed mean, shape (n, actions), for observations of the task, shape (n, observations), float32."""
+        return self.limit * torch.tanh(self.spread(self.normalizer(obs))[0])
 
     def spread(self, observations: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """As :meth:`forward`, for observations that are already normalised."""
+        """Mean and logarithm of the standard deviation, before squashing, each of shape (n, actions), for normalised observations."""
         mean, raw = self.head(self.body(observations)).chunk(2, dim=-1)
         low, high = LOG_STD
         return mean, low + 0.5 * (high - low) * (torch.tanh(raw) + 1.0)
@@ -93,9 +85,20 @@ class SquashedGaussianActor(nn.Module):
         slope = 2.0 * (math.log(2.0) - before - softplus(-2.0 * before))
         return self.limit * torch.tanh(before), (normal - slope).sum(-1)
 
-    def best(self, observations: torch.Tensor) -> torch.Tensor:
-        """The action without noise, shape (n, actions), for observations of the task."""
-        return self.limit * torch.tanh(self(observations)[0])
+    @torch.no_grad()
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """The best action for each world, shape (n, actions), float32."""
+        actions: torch.Tensor = self(observations[POLICY])
+        return actions
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        """No-op: the policy has no recurrent state."""
+
+    def module(self) -> ExportedPolicy:
+        """A copy on the CPU, with the input ``obs``; the observations are normalised inside."""
+        network = copy.deepcopy(self).cpu().eval()
+        sample = synthetic({POLICY: (self.observations,)}, network.normalizer)
+        return ExportedPolicy(network, {"obs": sample[POLICY][:1]}, ("actions",), sample)
 
 
 class Critics(nn.Module):
@@ -156,49 +159,6 @@ class Critics(nn.Module):
             return probabilities.mean(0)
         least = (probabilities @ self.values).argmin(0)
         return probabilities.gather(0, least.view(1, -1, 1).expand(1, -1, self.atoms))[0]
-
-
-class SquashedPolicy:
-    """The learnt policy of SAC: the squashed mean action."""
-
-    def __init__(self, actor: SquashedGaussianActor) -> None:
-        self.actor = actor
-
-    @torch.no_grad()
-    def act(self, observations: TensorDict) -> torch.Tensor:
-        """The best action for each world, shape (n, actions), float32."""
-        best: torch.Tensor = self.actor.best(observations[POLICY])
-        return best
-
-    def reset(self, worlds: torch.Tensor | None = None) -> None:
-        """No-op: the policy has no recurrent state."""
-
-    def module(self) -> ExportedPolicy:
-        """The mean action as a function of ``obs``, shape (batch, observations); the observations are normalised inside."""
-        network = _Best(self.actor)
-        seen = made_up({POLICY: (self.actor.observations,)}, network.actor.normalizer)
-        return ExportedPolicy(network, {"obs": seen[POLICY][:1]}, ("actions",), seen)
-
-    def state_dict(self) -> Mapping[str, Any]:
-        """The actor's tensors, with its normaliser's."""
-        state: Mapping[str, Any] = self.actor.state_dict()
-        return state
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> Any:
-        """Load the result of :meth:`state_dict`. Raises RuntimeError if it does not fit."""
-        return self.actor.load_state_dict(state)
-
-
-class _Best(nn.Module):
-    """The mean action as a separate module, on the CPU."""
-
-    def __init__(self, actor: SquashedGaussianActor) -> None:
-        super().__init__()
-        self.actor = copy.deepcopy(actor).cpu()
-        self.eval()
-
-    def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        return self.actor.best(obs)
 
 
 def make_normalizer(config: SACConfig, size: int) -> nn.Module:

@@ -83,10 +83,6 @@ class ReplayBuffer:
         self.recorded += steps
         self._recorded.fill_(self.recorded)
 
-    def clear(self) -> None:
-        """Forget everything."""
-        self.advance(-self.recorded)
-
     def draw(self, rows: torch.Tensor, generator: torch.Generator, steps: int = 0) -> bool:
         """Draw the transitions to learn from after ``steps`` more steps are written.
 
@@ -109,14 +105,9 @@ class ReplayBuffer:
 
     def sample(self, rows: torch.Tensor) -> Batch:
         """The transitions that begin in ``rows``, shape (samples,), int64."""
-        last, returns, discounts = torch.empty_like(rows), *self._powers.new_empty(2, len(rows)).unbind()
-        kernels.look_ahead(rows, self.outcomes.flatten(0, 1), self.worlds, self._powers, last, returns, discounts)
+        last, returns, discounts = kernels.look_ahead(rows, self.outcomes.flatten(0, 1), self.worlds, self._powers)
         before, after = self.before.flatten(0, 1)[rows], self.after.flatten(0, 1)[last]
         return Batch(before, after, returns, discounts)
-
-    def newest(self, slots: torch.Tensor) -> torch.Tensor:
-        """Observations and actions in ``slots``, shape (steps,), int64: shape (steps, worlds, observations + actions)."""
-        return self.before[slots]
 
     def world_state(self) -> dict[str, torch.Tensor]:
         """Live views of all written steps, leading dimension (worlds,)."""

@@ -22,13 +22,13 @@ from typing import Any, ClassVar
 import torch
 from tensordict import TensorDict
 
-from worker.learning import moments
 from worker.learning.algorithm import POLICY, LearningSetting, Spaces, Transition
 from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.observations import gather_moments, merge_moments
 from worker.learning.randomness import mix_seed
 from worker.learning.sac import kernels
 from worker.learning.sac.learner import LOSSES, Learner
-from worker.learning.sac.networks import SquashedGaussianActor, SquashedPolicy, check_spaces, size_of
+from worker.learning.sac.networks import SquashedGaussianActor, check_spaces, size_of
 from worker.learning.sac.replay_buffer import ReplayBuffer
 from worker.settings.sac import SACConfig
 
@@ -62,19 +62,19 @@ class SAC:
         )
         if setting.rehearsal:
             self.replay.advance(max(config.replay_steps, config.warm_up))
-        self._saves_replay = self._decide_saving(tells=self.gang.is_main and not setting.rehearsal)
+        self._saves_replay = self._decide_saving(reports=self.gang.is_main and not setting.rehearsal)
         self._updates = 0
         self._learns = False
         self._allocate(width, spaces.actions)
         self._make_graphs()
 
-    def _decide_saving(self, *, tells: bool) -> bool:
-        """Whether checkpoints hold the replay; the same on all ranks. ``tells``: print the decision if the settings leave it open."""
+    def _decide_saving(self, *, reports: bool) -> bool:
+        """Whether checkpoints hold the replay; the same on all ranks. ``reports``: print the decision if the settings leave it open."""
         if self.config.save_replay != "auto":
             return self.config.save_replay
         most, ranks = SAVED[self.device.partition(":")[0]], self.gang.size
         size = self.replay.nbytes // self.share.count * -(-self.share.total // ranks)
-        if size > most and tells:
+        if size > most and reports:
             print(
                 f"checkpoints do not hold the replay, {size / 2**20:,.0f} MiB a rank: a run that is resumed fills a new one first "
                 "(sac.save_replay: true saves it, and takes longer to save)",
@@ -95,6 +95,10 @@ class SAC:
         self._all_noise = torch.zeros(config.updates, 2, samples, actions, device=device)
         self._rows, self._noise = torch.zeros_like(self._all_rows[0]), torch.zeros_like(self._all_noise[0])
         self._moment_sums = torch.zeros(1 + 2 * width, dtype=torch.float64, device=device)
+        columns = self.learner.columns
+        sums = [self._moment_sums[1 + 2 * each.start : 1 + 2 * each.stop] for each in columns]
+        self._moments = list(zip(self.learner.normalizers, columns, sums, strict=True))
+        """For each group: its normaliser, its columns, and the sums of its moments, shape (2 · size,)."""
         self._loss_sums = torch.zeros(len(LOSSES), device=device)
         counts = {"actor_loss": config.updates // config.policy_delay, "entropy": config.updates // config.policy_delay}
         self._counts = torch.tensor([counts.get(name, config.updates) for name in LOSSES], device=device)
@@ -144,7 +148,8 @@ class SAC:
         """Actions of the policy with its noise, or uniform ones, shape (worlds, actions), float32."""
         for group, columns in zip(self._groups, self.learner.columns, strict=True):
             self._before[:, columns].copy_(observations[group])
-        mean, log_std = self.learner.actor(self._before[:, self.learner.columns[0]])
+        actor, seen = self.learner.actor, self._before[:, self.learner.columns[0]]
+        mean, log_std = actor.spread(actor.normalizer(seen))
         if self._step == 0:
             self._spread.copy_(log_std.exp().mean())
         first, limit = self.share.first, self.config.action_limit
@@ -196,21 +201,15 @@ class SAC:
 
     @torch.no_grad()
     def _gather_moments(self) -> None:
-        seen = self.replay.newest(self._slots)
-        self._moment_sums[0].fill_(seen.shape[0] * seen.shape[1])
-        for normalizer, columns, sums in self._moments():
-            moments.gather(seen[..., columns], normalizer, sums)
+        newest = self.replay.before[self._slots]
+        self._moment_sums[0].fill_(newest.shape[0] * newest.shape[1])
+        for normalizer, columns, sums in self._moments:
+            gather_moments(newest[..., columns], normalizer, sums)
 
     @torch.no_grad()
     def _merge_moments(self) -> None:
-        for normalizer, _, sums in self._moments():
-            moments.merge(normalizer, self._moment_sums[0], sums)
-
-    def _moments(self) -> list[tuple[torch.nn.Module, slice, torch.Tensor]]:
-        """For each group: its normaliser, its columns, and the sums of its moments, shape (2 · size,)."""
-        columns = self.learner.columns
-        sums = [self._moment_sums[1 + 2 * each.start : 1 + 2 * each.stop] for each in columns]
-        return list(zip(self.learner.normalizers, columns, sums, strict=True))
+        for normalizer, _, sums in self._moments:
+            merge_moments(normalizer, self._moment_sums[0], sums)
 
     def _update(self) -> None:
         """All updates of an iteration."""
@@ -239,15 +238,15 @@ class SAC:
 
     # -- state --------------------------------------------------------------------------------------------------------
 
-    def policy(self) -> SquashedPolicy:
-        """A live view of the learnt policy."""
-        return SquashedPolicy(self.learner.actor)
+    def policy(self) -> SquashedGaussianActor:
+        """The actor is the policy."""
+        return self.learner.actor
 
     @classmethod
-    def build_policy(cls, config: SACConfig, spaces: Spaces, device: str) -> SquashedPolicy:
+    def build_policy(cls, config: SACConfig, spaces: Spaces, device: str) -> SquashedGaussianActor:
         """A policy that can load the ``policy`` of a :meth:`state_dict`."""
         check_spaces(spaces, (POLICY,))
-        return SquashedPolicy(SquashedGaussianActor(config, size_of(spaces, POLICY), spaces.actions).to(device))
+        return SquashedGaussianActor(config, size_of(spaces, POLICY), spaces.actions).to(device)
 
     def state_dict(self) -> Mapping[str, Any]:
         """Networks, normalisers, temperature, optimizers, and the number of updates."""
@@ -277,4 +276,4 @@ class SAC:
         if state:
             self.replay.load_world_state(state)
         else:
-            self.replay.clear()
+            self.replay.advance(-self.replay.recorded)

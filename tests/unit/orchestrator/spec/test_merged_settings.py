@@ -140,7 +140,7 @@ class HopConfig:
 """,
     "hopper.py": """
 from hopper_settings import HopConfig
-from worker.learning.plain_ppo import PlainPPO
+from tests.support.worker.plain_ppo import PlainPPO
 
 class Hop(PlainPPO):
     config_type = HopConfig

@@ -1,8 +1,7 @@
-"""PPO in one file, to be read from top to bottom: the computation of algorithm ``ppo``, step by step.
+"""PPO in one file, to be read from top to bottom: the reference with which the tests compare algorithm ``ppo``.
 
-Read it, copy it and change it; the tests compare ``ppo`` with it. It is slower, especially on a GPU, for which it waits at every
-minibatch. In a job: ``algorithm: worker.learning.plain_ppo:PlainPPO``, with the settings of ``ppo`` under ``settings``.
-In comments, S steps of the W worlds of this rank are a rollout, and N = S · W its samples: step s of world w is row s · W + w.
+It has numbers alone, neither choices nor images, and Adam. In comments, S steps of the W worlds of this rank are a rollout, and N = S · W
+its samples: step s of world w is row s · W + w.
 """
 
 from __future__ import annotations
@@ -67,8 +66,6 @@ class GaussianActor(Network):
     """The policy: the network's output is the mean of the actions; the standard deviation of each action is also learnt."""
 
     def __init__(self, spaces: Spaces, config: PPOConfig) -> None:
-        if spaces.discrete or len(spaces.observations[POLICY]) != 1:
-            raise ValueError("task: plain PPO has neither choices nor images; algorithm ppo has both")
         super().__init__(spaces.observations[POLICY][0], config.hidden_sizes, spaces.actions, config)
         self.std = nn.Parameter(torch.full((spaces.actions,), config.init_std))
 
@@ -99,12 +96,6 @@ class PlainPPO:
 
     def __init__(self, config: PPOConfig, setting: LearningSetting) -> None:
         group, groups = config.critic_observations, setting.spaces.observations
-        if group not in groups or len(groups[group]) != 1:
-            raise ValueError(f"critic_observations: the task has no numbers {group!r}; see algorithm ppo")
-        if config.minibatches > config.steps:
-            raise ValueError(f"minibatches: {config.minibatches} are more than the {config.steps} steps of a world")
-        if config.optimizer != "adam":
-            raise ValueError(f"optimizer: plain PPO has adam alone; algorithm ppo has {config.optimizer}")
         self.config, self.setting, self.gang, self.steps = config, setting, setting.gang, config.steps
         device, self.rate = setting.gang.device, config.learning_rate
         self.actor = GaussianActor(setting.spaces, config)

@@ -1,4 +1,7 @@
-"""The adoption of another run's weights by a clone: it begins with the copy in its own directory (:mod:`shared_store.volume.initial_weights`)."""
+"""The initial weights of a run: those of a clone's parent, which it adopts, and those of a teacher, whom its algorithm imitates.
+
+A clone's are in its own directory (:mod:`shared_store.volume.initial_weights`).
+"""
 
 from __future__ import annotations
 
@@ -13,12 +16,13 @@ from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.initial_weights import parent_checkpoint
 from shared_store.volume.run_settings import first_difference, fixed_settings, innermost
-from worker.learning.algorithm import Algorithm
+from worker.learning.algorithm import Algorithm, Student
 from worker.learning.algorithms import section_of
 from worker.learning.distributed import Gang
-from worker.learning.job import Job
+from worker.learning.job import Job, user_errors
 from worker.learning.setup import contract_from
 from worker.learning.shards import read_file
+from worker.learning.trained import choose_checkpoint, chosen_by_main
 from worker.settings.errors import UserError
 
 
@@ -34,35 +38,31 @@ def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) 
     Raises:
         UserError: The weights are missing, damaged or do not fit; the message names the differing tensor or setting.
     """
-    name, problem = None, ""
-    if gang.is_main:
-        try:
-            found = parent_checkpoint(job.run)
-            name = found.name if found else None
-            if name is None and job.parent:
-                problem = "run.json does not name them: the run was deleted before it began"
-        except (DamagedCheckpoint, DamagedFile, OSError) as error:
-            problem = str(error)
-    if problem := gang.tell(problem) or "":
+
+    def choose() -> Checkpoint | None:
+        if (found := parent_checkpoint(job.run)) is None and job.parent:
+            raise DamagedCheckpoint("run.json does not name them: the run was deleted before it began")
+        return found
+
+    errors = DamagedCheckpoint, DamagedFile, OSError
+    checkpoint, problem = chosen_by_main(gang, job.run.parent, choose, errors)
+    if problem:
         raise UserError(
             f"run {job.run.name} can't begin with the weights of {job.parent or 'its parent'}: {problem}; clone it again under another name"
         )
-    name = gang.tell(name)
-    if name is None:
+    if checkpoint is None:
         return None
-    iteration, epoch = name.split("-e")
-    checkpoint = Checkpoint(job.run.parent / name, int(iteration), int(epoch))
     learnt: Any = read_file(checkpoint, "learner.pt", gang.device).get("algorithm")
-    here = json.loads(json.dumps(facts))
+    there, here = checkpoint.manifest, json.loads(json.dumps(facts))
     _check_settings(checkpoint, here, algorithm)
     try:
         algorithm.load_state_dict(learnt, weights_only=True)
     except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         why = _difference(algorithm.state_dict(), learnt) or " ".join(str(error).split())[:300]
         raise UserError(
-            f"the weights of checkpoint {name} do not fit this job: {why}{_others(checkpoint.manifest, here)}"
+            f"the weights of checkpoint {checkpoint.name} do not fit this job: {why}{_context(there, here)}"
         ) from error
-    then, now = (contract_from(facts, checkpoint.name) for facts in (checkpoint.manifest, here))
+    then, now = (contract_from(facts, checkpoint.name) for facts in (there, here))
     if gang.is_main and then and now:
         if lines := differences(then, now, ranges=True):
             print(f"warning: the weights were learnt with another policy contract: {brief(lines)}", flush=True)
@@ -71,6 +71,36 @@ def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) 
                 f"warning: the weights were learnt on another robot than the file gives now: {brief(lines)}", flush=True
             )
     return checkpoint
+
+
+def load_teacher(job: Job, gang: Gang, algorithm: Algorithm, adopted: Checkpoint | None) -> None:
+    """Load the weights of the teacher that a new run's settings name (:class:`worker.learning.algorithm.Student`). All ranks call it.
+
+    Args:
+        job: The job, in the same store as the teacher's run.
+        gang: The ranks.
+        algorithm: The algorithm, with or without a teacher.
+        adopted: The checkpoint with the run's initial weights; if it was made with the same teacher, it holds the teacher.
+
+    Raises:
+        UserError: The checkpoint does not exist, is of an older Muster, or its weights do not fit.
+    """
+    if not isinstance(algorithm, Student) or not (reference := algorithm.teacher_checkpoint):
+        return
+    if adopted and (adopted.manifest.get("settings") or {}).get("teacher_checkpoint") == reference:
+        return
+    name, _, iteration = reference.partition("@")
+    copy = job.run.teacher(name)  # chosen when the job was submitted, unless the teacher's run did not exist yet
+    is_copied = gang.tell("copied" if copy.checkpoints.is_dir() else None)
+    checkpoint = choose_checkpoint(gang, copy if is_copied else job.store.run(name), iteration or None)
+    if "algorithm" not in checkpoint.manifest:
+        raise UserError(
+            f"teacher_checkpoint: checkpoint {checkpoint.name} of run {name} is of an older Muster, which knew no algorithms; "
+            "train the teacher again"
+        )
+    learnt = read_file(checkpoint, "learner.pt", gang.device)["algorithm"]
+    with user_errors("train"):
+        algorithm.load_teacher(learnt)
 
 
 def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: Algorithm) -> None:
@@ -92,30 +122,30 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
         )
 
 
-def _others(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
-    """The differences in algorithm or in the policy's inputs and outputs, in words; empty without any."""
+def _context(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+    """The differences in algorithm or in the policy's inputs and outputs, as text; empty without any."""
     if there.get("algorithm") != here["algorithm"]:
         return f"; they are of algorithm {there.get('algorithm')}, and {here['algorithm']} does not read them"
-    told = []
+    spaces = []
     for facts in (there, here):
         policy = facts.get("policy") or {}
         groups = ", ".join(f"{name} {shape}" for name, shape in sorted((policy.get("groups") or {}).items()))
-        told.append(f"observations {groups} and {policy.get('action_size')} actions (task {facts.get('task')})")
-    return "" if told[0].partition(" (")[0] == told[1].partition(" (")[0] else f"; there {told[0]}, here {told[1]}"
+        spaces.append(f"observations {groups} and {policy.get('action_size')} actions")
+    tasks = [f"(task {facts.get('task')})" for facts in (there, here)]
+    return "" if spaces[0] == spaces[1] else f"; there {spaces[0]} {tasks[0]}, here {spaces[1]} {tasks[1]}"
 
 
 def _difference(own: Any, saved: Any) -> str:
     """The first tensor of the networks that is missing on one side or has another shape; empty without any."""
     if not isinstance(saved, Mapping):
         return f"it holds a {type(saved).__name__} where the state of an algorithm is expected"
-    shapes, there = (dict(_shapes(each)) for each in (own, saved))
-    for name, shape in shapes.items():
-        if name in there and there[name] != shape:
-            return f"{name} has shape {there[name]} there and {shape} here"
-    for name in shapes:
-        if name not in there:
-            return f"{name} is not there"
-    return next((f"{name} is there, and this job's algorithm has none" for name in there if name not in shapes), "")
+    here, there = (dict(_shapes(each)) for each in (own, saved))
+    for name in here:
+        if name in there and there[name] != here[name]:
+            return f"{name} has shape {there[name]} there and {here[name]} here"
+    if missing := [name for name in here if name not in there]:
+        return f"{missing[0]} is not there"
+    return next((f"{name} is there, and this job's algorithm has none" for name in there if name not in here), "")
 
 
 def _shapes(state: Any, path: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:
