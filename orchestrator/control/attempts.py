@@ -26,36 +26,9 @@ from orchestrator.control.run_store import Errands, Key, ObservedRun, RunContent
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
+from orchestrator.domain import attempt_instructions as do
 from orchestrator.domain.attempt import FINISHING, AttemptPhase, AttemptState, after, step
-from orchestrator.domain.attempt_events import (
-    Delayed,
-    Due,
-    Event,
-    Gone,
-    LaunchDelayed,
-    Launched,
-    LaunchRefused,
-    Preempted,
-    Prepared,
-    PrepareDelayed,
-    PrepareRefused,
-)
-from orchestrator.domain.attempt_instructions import (
-    Close,
-    Decide,
-    Explain,
-    Instruction,
-    Keep,
-    Launch,
-    MarkRunning,
-    Observe,
-    Prepare,
-    Save,
-    Stop,
-    TakeEpoch,
-    WindUp,
-    Withdraw,
-)
+from orchestrator.domain.attempt_events import Delayed, Due, Event, Gone, Launched, Preempted, Prepared, Refused
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status
 from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
@@ -189,11 +162,11 @@ class Attempts:
         """Carry out the instructions that follow from an event, and from the events that these cause."""
         for instruction in step(opened.state, event):
             match instruction:
-                case Save():
+                case do.Save():
                     yield opened.committed
-                case Withdraw(reason):
+                case do.Withdraw(reason):
                     yield self._withdraw(job, attempt, opened, reason)
-                case Close():
+                case do.Close():
                     yield self._close(session, job, attempt, opened, instruction)
                 case _:
                     then = self._carry_out(session, job, attempt, opened, instruction)
@@ -222,41 +195,41 @@ class Attempts:
         return opened
 
     def _carry_out(
-        self, session: Session, job: Job, attempt: Attempt, opened: _Open, instruction: Instruction
+        self, session: Session, job: Job, attempt: Attempt, opened: _Open, instruction: do.Instruction
     ) -> Event | None:
         match instruction:
-            case Prepare():
+            case do.Prepare():
                 return self._prepare(session, job, attempt, opened)
-            case TakeEpoch(epoch):
+            case do.TakeEpoch(epoch):
                 attempt.epoch = epoch
                 waited = attempt.held_since - (job.queued_since or attempt.held_since) if attempt.held_since else 0
                 opened.uncommitted.append(self.monitoring.begun(job, attempt, waited / 1000))
                 job.first_epoch = job.first_epoch or epoch
-            case Launch(again):
+            case do.Launch(again):
                 return self._launch(job, attempt, again)
-            case Keep(handle):
+            case do.Keep(handle):
                 attempt.handle = handle
-            case Observe():
+            case do.Observe():
                 return self._observer.observe(job, attempt)
-            case Explain(reason):
+            case do.Explain(reason):
                 if job.status_reason != reason:
                     job.status_reason = reason
-            case MarkRunning(reason, moment):
+            case do.MarkRunning(reason, moment):
                 self._mark_running(session, job, attempt, reason, moment)
-            case Decide(verdict):
+            case do.Decide(verdict):
                 attempt.ending, attempt.status_reason = verdict.ending, verdict.reason
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
                 if verdict.start_error is not None:
                     attempt.nodes[job.gang.main].reason = verdict.start_error
-            case Stop():
+            case do.Stop():
                 return self._stop(job, attempt, opened, instruction)
-            case WindUp():
+            case do.WindUp():
                 return Gone(self.clock.now(), [], "")
         return None
 
     def _prepare(
         self, session: Session, job: Job, attempt: Attempt, opened: _Open
-    ) -> Prepared | PrepareDelayed | PrepareRefused | Delayed | None:
+    ) -> Prepared | Delayed | Refused | None:
         """Look at the run, record its owner, then take it."""
         key = opened.key
         try:
@@ -269,9 +242,9 @@ class Attempts:
                 opened.taking = self._take(session, job, attempt, opened.run)
             epoch = self._errands.result(key, "claim", opened.taking, again=False)
         except StoreUnavailable as error:
-            return PrepareDelayed(str(error))
+            return Delayed(str(error), idle=True)
         except (RunRefused, ValueError) as error:
-            return PrepareRefused(str(error))
+            return Refused(str(error))
         return Prepared(epoch) if epoch is not None else self._errands.delayed(key)
 
     def _take(self, session: Session, job: Job, attempt: Attempt, run: ObservedRun) -> Callable[[], int]:
@@ -298,9 +271,9 @@ class Attempts:
         try:
             return Launched(self.engine.launch(_name(attempt), [node.host for node in attempt.nodes], plan, again))
         except NotYet as wait:
-            return LaunchDelayed(str(wait), wait.unknown)
+            return Delayed(str(wait), idle=not wait.unknown)
         except EngineError as error:
-            return LaunchRefused(str(error), is_final=not isinstance(error, CannotStart))
+            return Refused(str(error), is_final=not isinstance(error, CannotStart))
 
     def gang(self, job: Job, attempt: Attempt, spec: GangSpec, options: Mapping[str, str]) -> Gang:
         """The gang that the engine starts for an attempt; ``options``: those of its compute environment and queue."""
@@ -345,7 +318,7 @@ class Attempts:
             array.started_at = job.started_at
         job.move(Status.RUNNING, reason)
 
-    def _stop(self, job: Job, attempt: Attempt, opened: _Open, stop: Stop) -> Gone | Delayed | None:
+    def _stop(self, job: Job, attempt: Attempt, opened: _Open, stop: do.Stop) -> Gone | Delayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
         key = opened.key
         assert attempt.handle is not None
@@ -405,7 +378,9 @@ class Attempts:
             else:
                 self._open.pop(opened.key[0])
 
-    def _close(self, session: Session, job: Job, attempt: Attempt, opened: _Open, close: Close) -> Callable[[], None]:
+    def _close(
+        self, session: Session, job: Job, attempt: Attempt, opened: _Open, close: do.Close
+    ) -> Callable[[], None]:
         """Record the end; returns what follows the commit."""
 
         def closed() -> None:

@@ -6,32 +6,18 @@ from dataclasses import replace
 
 import pytest
 
+from orchestrator.domain import attempt_instructions as do
 from orchestrator.domain.attempt import SHORTEST_REQUEUE, AttemptPhase, AttemptState, Terms, after, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
     Event,
     Gone,
-    LaunchDelayed,
     Launched,
-    LaunchRefused,
     Observed,
     Preempted,
     Prepared,
-    PrepareDelayed,
-    PrepareRefused,
-)
-from orchestrator.domain.attempt_instructions import (
-    AwaitCause,
-    AwaitChildren,
-    Close,
-    Decide,
-    Explain,
-    Keep,
-    MarkRunning,
-    Save,
-    Stop,
-    TakeEpoch,
+    Refused,
 )
 from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict
 from orchestrator.domain.native_options import NativeOptions
@@ -52,9 +38,9 @@ def test_phases_follow_one_another() -> None:
 
 def test_a_gang_that_failed_for_good_has_little_to_save() -> None:
     seen = Observed(2000, (None, NodeEnd(1, "exit 1", 1.0)), (None, None))
-    decided = Decide(Verdict(Ending.FATAL, "node 1: exit 1", 1))
-    stop = Stop(5.0, "node 1: exit 1; its nodes are ending")
-    assert [each for each in step(RUNNING, seen) if not isinstance(each, Explain)] == [decided, Save(), stop]
+    decided = do.Decide(Verdict(Ending.FATAL, "node 1: exit 1", 1))
+    stop = do.Stop(5.0, "node 1: exit 1; its nodes are ending")
+    assert [each for each in step(RUNNING, seen) if not isinstance(each, do.Explain)] == [decided, do.Save(), stop]
 
 
 def test_a_look_has_a_silence_for_every_node() -> None:
@@ -65,30 +51,30 @@ def test_a_look_has_a_silence_for_every_node() -> None:
 def test_who_leaves_on_request_after_a_while_starts_again_though_no_attempt_is_left() -> None:
     left = replace(RUNNING, terms=replace(RUNNING.terms, spent=1), verdict=Verdict(Ending.REQUEUE, "why"))
     [close] = step(left, Gone(1000 + SHORTEST_REQUEUE, (), ""))
-    assert isinstance(close, Close) and (close.status, close.spent) == (Status.RUNNABLE, False)
+    assert isinstance(close, do.Close) and (close.status, close.spent) == (Status.RUNNABLE, False)
 
 
 def test_what_is_known_after_each_instruction() -> None:
     verdict = Verdict(Ending.FAILED, "why")
-    assert after(PREPARING, TakeEpoch(7)) == LAUNCHING
-    assert after(LAUNCHING, Keep("handle")) == STARTING
-    assert after(STARTING, MarkRunning("runs", 1000)) == RUNNING
-    assert after(RUNNING, AwaitCause(5)) == replace(RUNNING, cause_since=5)
-    assert after(RUNNING, AwaitChildren(6)) == replace(RUNNING, done_since=6)
-    assert after(RUNNING, Decide(verdict)) == replace(RUNNING, verdict=verdict)
-    assert after(RUNNING, Close(9, True, Status.FAILED, "why")) == replace(RUNNING, closed=True)
-    assert after(RUNNING, Explain("why")) == RUNNING
+    assert after(PREPARING, do.TakeEpoch(7)) == LAUNCHING
+    assert after(LAUNCHING, do.Keep("handle")) == STARTING
+    assert after(STARTING, do.MarkRunning("runs", 1000)) == RUNNING
+    assert after(RUNNING, do.Await("cause_since", 5)) == replace(RUNNING, cause_since=5)
+    assert after(RUNNING, do.Await("done_since", 6)) == replace(RUNNING, done_since=6)
+    assert after(RUNNING, do.Decide(verdict)) == replace(RUNNING, verdict=verdict)
+    assert after(RUNNING, do.Close(9, True, Status.FAILED, "why")) == replace(RUNNING, closed=True)
+    assert after(RUNNING, do.Explain("why")) == RUNNING
 
 
 EVENTS = (
     *(
         Due(),
         Prepared(7),
-        PrepareDelayed("why"),
-        PrepareRefused("why"),
+        Delayed("why", idle=True),
+        Refused("why"),
         Launched("handle"),
-        LaunchDelayed("why", False),
-        LaunchRefused("why"),
+        Delayed("why", idle=True),
+        Refused("why"),
         Preempted("why"),
         Observed(2000, (None, None), (None, None)),
     ),
