@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from orchestrator import machine
 from orchestrator.control.admission import Admission
-from orchestrator.control.alarm import Alarm
 from orchestrator.control.attempts import Attempts
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
-from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.isolation import Isolation
 from orchestrator.control.kept_texts import KeptTexts
 from orchestrator.control.loaded import LoadedJobs
@@ -31,31 +27,11 @@ from orchestrator.persistence.session import Database
 from shared_store.volume.layout import Store
 
 
-@dataclass(frozen=True)
 class Controller:
     """The parts of a running controller, by name: what use cases act on and the server is made of. It does nothing itself."""
 
-    database: Database
-    writes: Writes
-    engines: EngineSet
-    access: StoreAccess
-    texts: KeptTexts
-    bus: Bus
-    clock: Clock
-    logs: LogHub
-    retention: Retention
-    attempts: Attempts
-    admission: Admission
-    work_queue: WorkQueue
-    monitoring: Monitoring
-    heartbeat: Heartbeat
-    alarm: Alarm
-    upkeep: Upkeep
-    reconciler: Reconciler
-
-    @classmethod
-    def assemble(
-        cls,
+    def __init__(
+        self,
         database: Database,
         engines: EngineSet,
         store: Store,
@@ -69,7 +45,7 @@ class Controller:
         identity: StoreIdentity | None = None,
         runs: RunStore | None = None,
         disk: Disk | None = None,
-    ) -> Controller:
+    ) -> None:
         """
         Args:
             database: Of the jobs.
@@ -89,67 +65,39 @@ class Controller:
             DatabaseError: The database can't be read.
         """
         machine.share_arenas()  # before the bus starts its threads
+        self.database, self.engines, self.bus = database, engines, bus
+        self.clock, self.monitoring, self.work_queue = clock or Clock(), Monitoring(), WorkQueue()
         volumes = {"store": store.path, "database": database.volume}
         checks = {"store": identity.problem} if identity else {}
         disk = disk or Disk({name: path for name, path in volumes.items() if path is not None}, min_free, checks)
-        clock, monitoring, heartbeat = clock or Clock(), Monitoring(), Heartbeat()
-        work_queue, loaded = WorkQueue(), LoadedJobs(database)
-        isolation = Isolation(database, loaded, heartbeat)
-        writes, access = Writes(database, isolation, disk), StoreAccess(store, peers, disk, identity)
-        logs = LogHub(database, bus, access.followed)
+        loaded = LoadedJobs(database)
+        isolation = Isolation(database, loaded, self.monitoring)
+        self.writes, self.access = Writes(database, isolation, disk), StoreAccess(store, peers, disk, identity)
+        self.logs = LogHub(database, bus, self.access.followed)
         runs = runs or RunStore(store, peers, *([identity.check] if identity else []))
-        texts = KeptTexts(database, store, runs.peers.id, writes.lock, access.shortage)
-        kept = Retention(
-            database,
-            store,
-            peers,
-            access.users,
-            access.beginning,
-            writes.lock,
-            access.check,
-            clock.now,
-            retention,
+        self.texts = KeptTexts(database, store, runs.peers.id, self.writes.lock, self.access.shortage)
+        self.retention = Retention(database, self.access, self.writes.lock, self.clock.now, retention)
+        changed, withdrawn = self.work_queue.gang_changed, isolation.withdrawn
+        self.attempts = Attempts(engines, runs, bus, self.clock, self.monitoring, changed, withdrawn, self.texts)
+        self.admission = Admission(
+            engines, disk, self.work_queue, loaded, self.clock, self.monitoring, isolation, self.attempts
         )
-        alarm = Alarm(work_queue)
-        attempts = Attempts(engines, runs, bus, clock, monitoring, alarm.gang_changed, isolation.withdrawn, texts)
-        admission = Admission(engines, disk, work_queue, loaded, clock, monitoring, isolation, attempts)
-        upkeep = Upkeep(database, writes, access, texts, kept, monitoring)
-        reconciler = Reconciler(
+        self.upkeep = Upkeep(database, self.writes, self.access, self.texts, self.retention, self.monitoring)
+        self.reconciler = Reconciler(
             database,
             engines,
             bus,
-            clock,
-            writes,
-            work_queue,
+            self.clock,
+            self.writes,
+            self.work_queue,
             loaded,
             isolation,
-            heartbeat,
-            alarm,
-            monitoring,
-            attempts,
-            admission,
-            logs,
-            upkeep,
+            self.monitoring,
+            self.attempts,
+            self.admission,
+            self.logs,
+            self.upkeep,
             interval,
-        )
-        return cls(
-            database=database,
-            writes=writes,
-            engines=engines,
-            access=access,
-            texts=texts,
-            bus=bus,
-            clock=clock,
-            logs=logs,
-            retention=kept,
-            attempts=attempts,
-            admission=admission,
-            work_queue=work_queue,
-            monitoring=monitoring,
-            heartbeat=heartbeat,
-            alarm=alarm,
-            upkeep=upkeep,
-            reconciler=reconciler,
         )
 
     def start(self) -> None:
@@ -168,4 +116,4 @@ class Controller:
 
     def problem(self) -> str | None:
         """Why the controller can't do its work now, as its loop has left it; waits for nothing."""
-        return self.heartbeat.problem() or self.reconciler.trouble or self.access.disk.absent("store")
+        return self.monitoring.loop_problem() or self.reconciler.trouble or self.access.disk.absent("store")

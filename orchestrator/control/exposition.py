@@ -51,7 +51,7 @@ class _Moment(Collector):
         controller = self._controller
         yield InfoMetricFamily("muster", "Version of the controller.", value={"version": __version__})
         age = "Seconds since the controller's loop made its last progress; /healthz fails above 5."
-        yield _gauge("muster_loop_age_seconds", age, [], {(): controller.heartbeat.age})
+        yield _gauge("muster_loop_age_seconds", age, [], {(): controller.monitoring.loop_age})
         try:
             with controller.database.session() as session:
                 found = [*self._jobs(session), *self._attempts(session)]
@@ -84,9 +84,9 @@ class _Moment(Collector):
         trainings = 0
         for job, attempt in open_attempts(session, self._controller.work_queue.active()):
             labels = (job.queue, engine_named(attempt))
-            given = held_by(attempt)
-            held["gpus"][labels] += given.gpus
-            held["cpus"][labels] += given.cpus
+            resources = held_by(attempt)
+            held["gpus"][labels] += resources.gpus
+            held["cpus"][labels] += resources.cpus
             try:
                 main = job.gang.main
             except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
@@ -110,8 +110,8 @@ class _Moment(Collector):
     def _volumes(self) -> GaugeMetricFamily:
         disk = self._controller.access.disk
         short = {(name,): float(disk.shortage(name) is not None) for name in disk.names}
-        said = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
-        return _gauge("muster_volume_short", said, ["volume"], short)
+        text = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
+        return _gauge("muster_volume_short", text, ["volume"], short)
 
     def _store(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
         calls = self._controller.access.calls
@@ -129,7 +129,7 @@ class _Moment(Collector):
                 gpus[(name,)] += len(host.gpus)
                 cpus[(name,)] += host.cpus
         for name, amounts in (("hosts", hosts), ("gpus", gpus), ("cpus", cpus)):
-            what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as it told them last."
+            what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as last reported."
             yield _gauge(f"muster_{name}", what, ["engine"], amounts)
 
 

@@ -9,8 +9,8 @@ from sqlalchemy import update
 from sqlalchemy.orm import Session
 
 from orchestrator.control.attempts import Steps
-from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.loaded import LoadedJobs
+from orchestrator.control.monitoring import Monitoring
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.toolkit.backoff import Backoff
@@ -27,8 +27,8 @@ log = logging.getLogger("muster.controller")
 class Isolation:
     """Carries out the work of the controller's loop, and remembers what fails. On the controller's thread alone."""
 
-    def __init__(self, database: Database, loaded: LoadedJobs, heartbeat: Heartbeat) -> None:
-        self._database, self._loaded, self._heartbeat = database, loaded, heartbeat
+    def __init__(self, database: Database, loaded: LoadedJobs, monitoring: Monitoring) -> None:
+        self._database, self._loaded, self._monitoring = database, loaded, monitoring
         self.trouble: str | None = None
         """Why the database can't be used at present: nothing is launched, and no request is accepted."""
         self.is_full = False
@@ -64,7 +64,7 @@ class Isolation:
         return [failed for portion in portions for failed in self._together(what, portion, body)]
 
     def _together(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
-        self._heartbeat.beat()
+        self._monitoring.beat()
         try:
             with self._loaded.session() as session:
                 jobs = self._loaded.jobs(session, ids)
@@ -92,7 +92,7 @@ class Isolation:
             for _, then in reached:
                 then()
             steps = [each for each, _ in reached]
-            self._heartbeat.beat()
+            self._monitoring.beat()
 
     def _failed(self, what: str, job_id: str, error: Exception) -> None:
         """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""

@@ -13,12 +13,10 @@ from sqlalchemy.orm import Session
 
 from orchestrator import machine
 from orchestrator.control.admission import Admission
-from orchestrator.control.alarm import Alarm
 from orchestrator.control.attempts import Attempts, Steps
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
-from orchestrator.control.heartbeat import Heartbeat
 from orchestrator.control.isolation import Isolation
 from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.log_hub import LogHub
@@ -56,8 +54,6 @@ class Reconciler:
         work_queue: WorkQueue,
         loaded: LoadedJobs,
         isolation: Isolation,
-        heartbeat: Heartbeat,
-        alarm: Alarm,
         monitoring: Monitoring,
         attempts: Attempts,
         admission: Admission,
@@ -65,11 +61,11 @@ class Reconciler:
         upkeep: Upkeep,
         interval: float,
     ) -> None:
-        """``interval``: seconds between two passes where nothing rings the alarm. Raises DatabaseError."""
+        """``interval``: seconds between two passes where nothing rings the alarm of the work queue. Raises DatabaseError."""
         self._database, self._engines, self._bus, self._clock, self._writes = database, engines, bus, clock, writes
         self._work_queue, self._loaded, self._isolation = work_queue, loaded, isolation
-        self._heartbeat, self._alarm, self._monitoring = heartbeat, alarm, monitoring
-        self._attempts, self._admission, self._logs, self._upkeep = attempts, admission, logs, upkeep
+        self._monitoring, self._attempts, self._admission, self._logs = monitoring, attempts, admission, logs
+        self._upkeep = upkeep
         self.interval = interval
         self._backoff = isolation.backoff
         self._is_cut_off = False
@@ -79,7 +75,7 @@ class Reconciler:
         self._ticking: int | None = None
         """The thread that makes a pass now."""
         self._thread: threading.Thread | None = None
-        bus.changed = engines.changed = alarm.gang_changed
+        bus.changed = engines.changed = work_queue.gang_changed
         database.committed, database.changed = self._committed, self._look_again
         isolation.before, loaded.reread = attempts.load_shared_rows, attempts.forget_states
         with database.session() as session:
@@ -98,7 +94,7 @@ class Reconciler:
     def close(self) -> None:
         """Leave the loop; running gangs continue, and the next controller on this database finds them."""
         self._ending.set()
-        self._alarm.ring()
+        self._work_queue.ring()
         if self._thread is not None:
             self._thread.join()
             machine.collect_all()
@@ -106,9 +102,9 @@ class Reconciler:
     def _loop(self) -> None:
         while not self._ending.is_set():
             self._isolation.part("reconciling", self.tick)
-            if self._alarm.wait(self.interval if self.trouble is None else _WITHOUT_DATABASE):
+            if self._work_queue.wait(self.interval if self.trouble is None else _WITHOUT_DATABASE):
                 self._ending.wait(_GATHERING)
-            self._alarm.clear()
+            self._work_queue.clear()
 
     def tick(self) -> None:
         """One pass over every job that needs a look; one that can't be handled now does not hold up the others.
@@ -116,7 +112,7 @@ class Reconciler:
         Raises DatabaseError where the database can't be used; the next pass tries again.
         """
         started, self._ticking = machine.monotonic(), threading.get_ident()
-        self._heartbeat.beat()
+        self._monitoring.beat()
         try:
             self._pass()
         finally:
@@ -135,7 +131,7 @@ class Reconciler:
         due = [job_id for job_id in taken if not self._backoff.waits(("settle", job_id))]
         self._work_queue.look_again(job_id for job_id in taken if self._backoff.waits(("settle", job_id)))
         if due and len(taken) == _SETTLED_A_TICK:
-            self._alarm.ring()  # the rest comes after a look at the gangs that run
+            self._work_queue.ring()  # the rest comes after a look at the gangs that run
         self._work_queue.look_again(self._isolation.jobs("settle", due, self._settle))
         if self._kept_version != self._work_queue.version:
             self._kept_version = self._work_queue.version

@@ -1,6 +1,6 @@
 """Retention: takes old jobs, their logs and their runs, in small steps, where nothing needs them (:mod:`orchestrator.domain.retention`).
 
-A run goes in three steps, none of which holds a lock while it waits for the store: under :attr:`Reconciler.writing` it is taken, so that no
+A run goes in three steps, none of which holds a lock while it waits for the store: under the lock of all writes it is taken, so that no
 request uses it any more; it is looked at again, and moved into the store's trash; then the rows of its jobs are deleted. Whatever dies in
 between leaves the run, or rows of jobs whose run is gone: the next pass deletes these.
 """
@@ -22,10 +22,9 @@ from sqlalchemy import and_, or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.peers import Peers
 from orchestrator.control.retention_looks import CONTROLLER, PassCursor, PassTotals, RetentionStep, Step, Whose
 from orchestrator.control.run_facts import StoredRuns
-from orchestrator.control.run_users import RunUsers
+from orchestrator.control.store_access import StoreAccess
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
@@ -37,7 +36,7 @@ from orchestrator.persistence.session import Database
 from shared_store.contract.error_text import counted
 from shared_store.volume import contents, trash
 from shared_store.volume.files import DamagedFile
-from shared_store.volume.layout import NAME, Store
+from shared_store.volume.layout import NAME
 
 log = logging.getLogger("muster.retention")
 
@@ -69,31 +68,23 @@ class Retention:
     def __init__(
         self,
         database: Database,
-        store: Store,
-        peers: Peers,
-        users: RunUsers,
-        beginning: Mapping[str, object],
+        access: StoreAccess,
         writing: threading.Lock,
-        check: Callable[[], None],
         steady: Callable[[], int],
         default: float | None = None,
     ) -> None:
         """
         Args:
             database: Of the jobs.
-            store: Of their runs.
-            peers: The other controllers of the store.
-            users: Who uses a run now.
-            beginning: Runs that requests begin now; changes while ``writing`` is held.
+            access: To the store of their runs.
             writing: Held while something is submitted.
-            check: Raises Unavailable where the store is not there: what is missing may be missing for that.
             steady: Steady time [ms]; of two clocks, the one that is behind decides.
             default: Seconds for which jobs of queues without a rule are kept; None: as :class:`RetentionRules` says. Infinity: without end,
                 and nothing goes by itself.
         """
-        self._database, self._store, self._users = database, store, users
-        self._beginning, self._writing, self._steady = beginning, writing, steady
-        self.stored = StoredRuns(store, peers, check)
+        self._database, self._store, self._users = database, access.store, access.users
+        self._beginning, self._writing, self._steady = access.beginning, writing, steady
+        self.stored = StoredRuns(access.store, access.peers, access.check)
         self._is_on = default != inf
         self._default = int(default * 1000) if default is not None and self._is_on else None
         self._removing = machine.pool("emptying the trash", _REMOVERS)

@@ -78,7 +78,7 @@ def test_hanging_reads_keep_neither_the_loop_nor_a_stop_nor_a_submission_waiting
             for _ in range(10):
                 assert asked(server, "/healthz").status_code == 200
             assert "muster_store_calls{" in asked(server, "/metrics").text
-            assert server.controller.heartbeat.age < 5 and not any(read.done() for read in reads)
+            assert server.controller.monitoring.loop_age < 5 and not any(read.done() for read in reads)
             client.batch("TerminateJob", jobId=job, reason="enough")
             other = submit_gang(client, "pass")
             described = lambda: client.batch("DescribeJobs", jobs=[other])["jobs"][0]["status"]  # noqa: E731

@@ -49,15 +49,13 @@ class FakeController(Generic[E]):
             session.add(JobQueue(name="urgent", priority=9, compute_environments=["fake"]))
         peers = Peers(self.store, home)
         runs = store_type(self.store, peers)
-        self.controller = Controller.assemble(
-            self.database, engines, self.store, Bus(home, {}), peers, interval=0.02, runs=runs
-        )
+        self.controller = Controller(self.database, engines, self.store, Bus(home, {}), peers, interval=0.02, runs=runs)
         stack.callback(self.controller.close)
 
     def submit(self, *names: str, **facts: Any) -> None:
         with self.database.session() as session:
             session.add_all(job(name, status=Status.RUNNABLE, **facts) for name in names)
-        self.controller.alarm.ring()
+        self.controller.work_queue.ring()
 
     def job(self, name: str) -> Job:
         with self.database.session() as session:

@@ -243,7 +243,7 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
                     assert sorted(os.listdir(run)) == ["logs", "outcomes", "run.json"], "nothing of it is missing"
             else:
                 assert (run / "results.csv").is_file()
-    world.users = RunUsers()  # another process
+    world.access.users = RunUsers()  # another process
     later: list[Callable[[], object]] = []
     following = world.retention()
     following.start(later.append)
