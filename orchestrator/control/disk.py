@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,8 +10,8 @@ from functools import partial
 from pathlib import Path
 
 from orchestrator import machine
+from orchestrator.domain.units import BYTES, amount
 
-_UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _INTERVAL = 0.5
 """Seconds between two looks at a volume."""
 _PATIENCE = 5.0
@@ -31,12 +30,14 @@ class MinFree:
     @classmethod
     def parse(cls, text: str) -> MinFree:
         """``512MiB``, ``5%`` or ``0``. Raises ValueError."""
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(%|[KMGT]i?B)?", text.strip())
-        if not match or (match[2] is None and float(match[1])) or (match[2] == "%" and float(match[1]) > 100):
-            raise ValueError("expected a size such as 1GiB, a share such as 5%, or 0")
-        if match[2] == "%":
-            return cls(share=float(match[1]) / 100)
-        return cls(size=int(float(match[1]) * _UNITS.get(match[2], 1)))
+        expected = "a size such as 1GiB, a share such as 5%, or 0"
+        if text.strip() == "0":
+            return cls(size=0)
+        if not text.strip().endswith("%"):
+            return cls(size=int(amount(text, BYTES, expected)))
+        if (percent := amount(text, {"%": 1}, expected)) > 100:
+            raise ValueError(f"expected {expected}")
+        return cls(share=percent / 100)
 
     def of(self, total: int) -> int:
         """Bytes of a volume of ``total`` bytes."""

@@ -18,12 +18,11 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import and_, or_, select
+from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.retention_looks import CONTROLLER, PassCursor, PassTotals, RetentionStep, Step, Whose
-from orchestrator.control.run_facts import StoredRuns
+from orchestrator.control.retention_facts import CONTROLLER, PassTotals, Requester, RetentionStep, Step, StoredRuns
 from orchestrator.control.store_access import StoreAccess
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
@@ -31,6 +30,7 @@ from orchestrator.domain.job import TERMINAL
 from orchestrator.domain.retention import JobFacts, References, RetentionRules, RunFacts, decide, still_needed
 from orchestrator.persistence import retention_rows as rows
 from orchestrator.persistence.batch_models import Job, JobQueue, RunRecord, now
+from orchestrator.persistence.keyset import Cursor, behind
 from orchestrator.persistence.own_models import RetentionStart, RunUse
 from orchestrator.persistence.session import Database
 from shared_store.contract.error_text import counted
@@ -168,9 +168,9 @@ class Retention:
             totals,
         )
 
-    def _all(self, step: Callable[[RetentionRules, PassCursor], Step]) -> PassTotals:
+    def _all(self, step: Callable[[RetentionRules, Cursor], Step]) -> PassTotals:
         """Step by step with the rules of each moment, and a rest after each."""
-        totals, place = PassTotals(), PassCursor()
+        totals, place = PassTotals(), Cursor()
         while not self._is_closing.is_set():
             began = machine.processor_time()
             looks, following = step(self.rules(), place)
@@ -203,11 +203,11 @@ class Retention:
 
     def step(
         self,
-        after: PassCursor,
+        after: Cursor,
         rules: RetentionRules,
         *,
         take: bool,
-        whose: Whose = CONTROLLER,
+        by: Requester = CONTROLLER,
         most: int = A_STEP,
     ) -> Step:
         """Look at the next jobs that are old enough, and take what may go.
@@ -216,7 +216,7 @@ class Retention:
             after: Where the step before ended.
             rules: As :meth:`rules` answers, or changed.
             take: Take it; else only look.
-            whose: Who asks.
+            by: Who requests it.
             most: Number of jobs.
 
         Returns:
@@ -228,21 +228,18 @@ class Retention:
         moment = self._moment()
         with self._database.session() as session:
             query = select(Job.id, Job.run, Job.stopped_at).where(rows.due(rules, moment))
-            behind = or_(
-                Job.stopped_at > after.stopped_at, and_(Job.stopped_at == after.stopped_at, Job.id < after.job)
-            )
-            query = query.where(behind, Job.stopped_at >= after.stopped_at)
-            if whose.queues is not None:
-                query = query.where(Job.owner == whose.name, Job.queue.in_(whose.queues))
+            query = query.where(behind((Job.stopped_at, Job.id), (after.at, after.id), (False, True)))
+            if by.queues is not None:
+                query = query.where(Job.owner == by.name, Job.queue.in_(by.queues))
             # of equal times an array behind its children
             found = session.execute(query.order_by(Job.stopped_at, Job.id.desc()).limit(most)).all()
-        looks = self._looks({row.run for row in found if NAME.fullmatch(row.run)}, rules, moment, whose)
+        looks = self._looks({row.run for row in found if NAME.fullmatch(row.run)}, rules, moment, by)
         wanted = [look.run for look in looks if look.decision.jobs]
         described = {look.run: look.described() for look in looks if not take or look.decision.reasons}
         if take and wanted:
             taken = self._take(wanted)
             try:
-                again = self._looks(taken, rules, moment, whose)
+                again = self._looks(taken, rules, moment, by)
                 described |= {look.run: look.described() for look in again}
                 gone, stay = self._carry_out(again)
                 for run, why in stay.items():
@@ -255,36 +252,36 @@ class Retention:
                 for run in taken:
                     self._users.let_go(run)
         shown = [each for each in described.values() if each["jobs"] or each["kept"]]
-        return shown, PassCursor(found[-1].stopped_at, found[-1].id) if len(found) == most else None
+        return shown, Cursor(found[-1].stopped_at, found[-1].id) if len(found) == most else None
 
     def _take(self, runs: Sequence[str]) -> list[str]:
         """Those of the runs that nobody uses; from now on nobody does."""
         with self._writing:
             return [run for run in runs if run not in self._beginning and self._users.take(run)]
 
-    def _looks(self, runs: Collection[str], rules: RetentionRules, moment: int, whose: Whose) -> list[RetentionStep]:
+    def _looks(self, runs: Collection[str], rules: RetentionRules, moment: int, by: Requester) -> list[RetentionStep]:
         """What may go of these runs and their jobs. Raises Unavailable, OSError."""
         if not runs:
             return []
         stored = self.stored.references(_FRESH)
         facts = self.stored.facts(runs)
         with self._database.session() as session:  # after the store: what was submitted meanwhile counts
-            jobs = self._jobs(session, runs, rules, moment, whose)
+            jobs = self._jobs(session, runs, rules, moment, by)
             needed = References.of(rows.references(session, runs)) | stored
-        needed = needed if whose.queues is None else needed.unnamed()
+        needed = needed if by.queues is None else needed.unnamed()
         return [self._look(run, facts[run], jobs[run], needed) for run in sorted(runs)]
 
     def _jobs(
-        self, session: Session, runs: Collection[str], rules: RetentionRules, moment: int, whose: Whose
+        self, session: Session, runs: Collection[str], rules: RetentionRules, moment: int, by: Requester
     ) -> dict[str, list[JobFacts]]:
         """The jobs of the runs; those of others, and all of a run that is another's, never go."""
         jobs = rows.jobs_of_runs(session, runs, rules, moment)
-        if whose.queues is None:
+        if by.queues is None:
             return jobs
         owners = session.execute(select(Job.id, Job.owner, Job.queue).where(Job.run.in_(runs)))
-        own = {job for job, owner, queue in owners if whose.owns(owner, queue)}
+        own = {job for job, owner, queue in owners if by.owns(owner, queue)}
         records = session.scalars(select(RunRecord).where(RunRecord.name.in_(runs)))
-        others = {record.name for record in records if not whose.owns(record.owner, record.queue)}
+        others = {record.name for record in records if not by.owns(record.owner, record.queue)}
         return {
             run: [each if each.id in own and run not in others else replace(each, is_due=False) for each in of_run]
             for run, of_run in jobs.items()
@@ -346,16 +343,16 @@ class Retention:
         """Remove what was thrown away, several at once: each waits for the file system's journal."""
         wait([self._removing.submit(partial(trash.remove, path)) for path in thrown])
 
-    # -- one run, as a person asks --------------------------------------------------------------------------------------
+    # -- one run, as a person requests --------------------------------------------------------------------------------------
 
-    def _needs(self, name: str, whose: Whose) -> tuple[RunFacts | None, list[str]]:
+    def _needs(self, name: str, by: Requester) -> tuple[RunFacts | None, list[str]]:
         """A run as the store has it, and why it may not be deleted, in words for who asks. Raises Unavailable, OSError."""
         stored, facts = self.stored.references(0.0), self.stored.facts([name])[name]
         rules, moment = self.rules(), self._moment()
         with self._database.session() as session:
             jobs = rows.jobs_of_runs(session, [name], rules, moment)[name]
             needed = References.of(rows.references(session, [name])) | stored
-        needed = needed if whose.queues is None else needed.unnamed()
+        needed = needed if by.queues is None else needed.unnamed()
         return facts, [] if facts is None else still_needed(facts, jobs, needed)
 
     def open_job(self, name: str) -> str | None:
@@ -365,7 +362,7 @@ class Retention:
             query = select(Job.id).where(or_(Job.run == name, Job.id.in_(using)), Job.status.not_in(TERMINAL))
             return session.scalars(query.limit(1)).first()
 
-    def delete(self, name: str, whose: Whose = CONTROLLER) -> dict[str, Any]:
+    def delete(self, name: str, by: Requester = CONTROLLER) -> dict[str, Any]:
         """Delete a run with all that it holds, for who asks; its jobs stay in the history.
 
         Returns:
@@ -376,7 +373,7 @@ class Retention:
             Unavailable, OSError: The store or the database can't be used.
         """
         with self.alone(name):
-            facts, reasons = self._needs(name, whose)
+            facts, reasons = self._needs(name, by)
             if reasons:
                 raise RunNeeded(f"run {name} is kept: {'; '.join(reasons)}")
             path = self._store.run(name).path

@@ -13,10 +13,11 @@ from sqlalchemy import func, select, update
 from orchestrator.control.disk import Disk
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention
-from orchestrator.control.retention_looks import CONTROLLER, PassCursor, Step, Whose
+from orchestrator.control.retention_facts import CONTROLLER, Requester, Step
 from orchestrator.control.store_access import StoreAccess
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS
 from orchestrator.persistence.batch_models import Attempt, Base, Dependency, Job, Node, RunRecord, now
+from orchestrator.persistence.keyset import Cursor
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.session import Database
 from shared_store.volume.files import write_json
@@ -39,11 +40,11 @@ class World:
         return Retention(self.database, self.access, self.writing, now, default)
 
     def step(
-        self, after: PassCursor = PassCursor(), *, take: bool, whose: Whose = CONTROLLER, most: int = 100, **rules: Any
+        self, after: Cursor = Cursor(), *, take: bool, by: Requester = CONTROLLER, most: int = 100, **rules: Any
     ) -> Step:
         """A step, with other rules."""
         retention = self.retention()
-        return retention.step(after, replace(retention.rules(), **rules), take=take, whose=whose, most=most)
+        return retention.step(after, replace(retention.rules(), **rules), take=take, by=by, most=most)
 
     def reasons(self) -> dict[str, str]:
         """Of each run that is kept, why."""

@@ -16,7 +16,8 @@ from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.job_counts import ArrayRole, JobCounts, note_rows
-from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
+from orchestrator.persistence.job_pages import contains, count, place_of, read_page
+from orchestrator.persistence.keyset import Cursor
 from orchestrator.persistence.retention_rows import forget_jobs
 from orchestrator.persistence.session import Database
 
@@ -80,14 +81,14 @@ def test_pages_in_both_directions_are_the_whole_list_once(
         assert page.is_first
         forth.append(page)
         while not page.is_last:
-            page = read_page(session, most, queues, statuses, after=Cursor.of(page.jobs[-1]))
+            page = read_page(session, most, queues, statuses, after=place_of(page.jobs[-1]))
             assert not page.is_first
             forth.append(page)
         assert [each for page in forth for each in ids(page.jobs)] == wanted
         assert all(len(page.jobs) == most for page in forth[:-1])
         back = []
         while not page.is_first and page.jobs:
-            page = read_page(session, most, queues, statuses, before=Cursor.of(page.jobs[0]))
+            page = read_page(session, most, queues, statuses, before=place_of(page.jobs[0]))
             back.append(page)
         assert [ids(page.jobs) for page in back] == [ids(page.jobs) for page in forth[-2::-1]]
 
@@ -98,16 +99,16 @@ def test_jobs_that_come_meanwhile_move_no_page_and_are_on_the_one_before(databas
         first = read_page(session, 30)
         session.add_all(job(f"new-{i}", 1000 + i) for i in range(40))
         session.flush()
-        second = read_page(session, 30, after=Cursor.of(first.jobs[-1]))
+        second = read_page(session, 30, after=place_of(first.jobs[-1]))
         assert ids(second.jobs) == listed[30:60]
         session.execute(delete(Job).where(Job.id == second.jobs[-1].id))
-        third = read_page(session, 30, after=Cursor.of(second.jobs[-1]))
+        third = read_page(session, 30, after=place_of(second.jobs[-1]))
         assert ids(third.jobs) == listed[60:] and third.is_last, "the place of a job that is gone is still a place"
-        beyond = read_page(session, 30, after=Cursor.of(third.jobs[-1]))
+        beyond = read_page(session, 30, after=place_of(third.jobs[-1]))
         assert (beyond.jobs, beyond.is_last) == ([], True)
-        newer = read_page(session, 30, before=Cursor.of(first.jobs[0]))
+        newer = read_page(session, 30, before=place_of(first.jobs[0]))
         assert ids(newer.jobs) == [f"new-{i}" for i in range(29, -1, -1)] and not newer.is_first
-        newest = read_page(session, 30, before=Cursor.of(newer.jobs[0]))
+        newest = read_page(session, 30, before=place_of(newer.jobs[0]))
         assert ids(newest.jobs) == [f"new-{i}" for i in range(39, 29, -1)] and newest.is_first
 
 
