@@ -134,7 +134,7 @@ class Deliveries:
         while not self._ending.is_set():
             wake.clear()  # before the look: what is committed after it wakes the thread
             try:
-                pause = _IDLE if self._controller.reconciler.trouble is not None else self._deliver_next(webhook)
+                pause = _IDLE if self._controller.trouble is not None else self._deliver_next(webhook)
             except DatabaseError:  # said by the controller
                 pause = _IDLE
             except Exception as error:

@@ -6,12 +6,11 @@ Nothing here looks into the store or waits for an engine: a volume that hangs ke
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import CollectorRegistry, Metric, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
-from prometheus_client.registry import Collector
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -33,21 +32,17 @@ _Sums = defaultdict[tuple[str, ...], float]
 
 def exposition(controller: Controller) -> bytes:
     """All of it in Prometheus's text format."""
-    now = CollectorRegistry()
-    now.register(_Moment(controller))
-    return generate_latest(controller.monitoring.registry) + generate_latest(now)
+    return generate_latest(controller.monitoring.registry) + generate_latest(_Moment(controller))
 
 
-class _Moment(Collector):
+class _Moment(CollectorRegistry):
     """The values at the moment of a scrape."""
 
     def __init__(self, controller: Controller) -> None:
+        super().__init__()
         self._controller = controller
 
-    def describe(self) -> Iterable[GaugeMetricFamily]:
-        return ()
-
-    def collect(self) -> Iterator[GaugeMetricFamily | InfoMetricFamily | CounterMetricFamily]:
+    def collect(self) -> Iterator[Metric]:
         controller = self._controller
         yield InfoMetricFamily("muster", "Version of the controller.", value={"version": __version__})
         age = "Seconds since the controller's loop made its last progress; /healthz fails above 5."
@@ -55,7 +50,7 @@ class _Moment(Collector):
         try:
             with controller.database.session() as session:
                 found = [*self._jobs(session), *self._attempts(session)]
-            usable = controller.reconciler.trouble is None
+            usable = controller.trouble is None
         except DatabaseError:  # then the scrape says this, and what needs no database
             found, usable = [], False
         yield _gauge("muster_database_usable", "1 while the database can be used, else 0.", [], {(): float(usable)})
@@ -113,7 +108,7 @@ class _Moment(Collector):
         text = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
         return _gauge("muster_volume_short", text, ["volume"], short)
 
-    def _store(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+    def _store(self) -> Iterator[Metric]:
         calls = self._controller.access.calls
         states = {("busy",): float(min(calls.open, THREADS)), ("waiting",): float(max(0, calls.open - THREADS))}
         yield _gauge("muster_store_calls", "Requests that use the store, by state.", ["state"], states)

@@ -35,24 +35,8 @@ class WorkQueue:
         self._shapes: dict[Shape, Shape] = {}
         self.version = 0
         """Grows whenever something changes that a scheduling pass depends on."""
-        self._alarm = threading.Event()
-
-    @property
-    def rings(self) -> bool:
-        """Whether its alarm has been rung since the last :meth:`clear`: the controller's loop then makes a pass at once."""
-        return self._alarm.is_set()
-
-    def ring(self) -> None:
-        """Something has changed."""
-        self._alarm.set()
-
-    def wait(self, seconds: float) -> bool:
-        """Wait until the alarm rings, or that long; returns whether it rings."""
-        return self._alarm.wait(seconds)
-
-    def clear(self) -> None:
-        """What has rung so far is seen to."""
-        self._alarm.clear()
+        self.alarm = threading.Event()
+        """Set by whatever changes something: the controller's loop then makes a pass at once."""
 
     def gang_changed(self, gang: str) -> None:
         """A gang has changed, by its name or that of its job; empty: what an engine has."""
@@ -60,7 +44,7 @@ class WorkQueue:
             self.hurry(gang.partition("/")[0])
         else:
             self.version += 1  # a pass depends on it
-        self.ring()
+        self.alarm.set()
 
     def load(self, session: Session) -> None:
         """Read all jobs that are not over, and forget the earlier state. PENDING jobs become due: one on which they depend may have ended."""

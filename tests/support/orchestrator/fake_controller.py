@@ -55,7 +55,7 @@ class FakeController(Generic[E]):
     def submit(self, *names: str, **facts: Any) -> None:
         with self.database.session() as session:
             session.add_all(job(name, status=Status.RUNNABLE, **facts) for name in names)
-        self.controller.work_queue.ring()
+        self.controller.work_queue.alarm.set()
 
     def job(self, name: str) -> Job:
         with self.database.session() as session:

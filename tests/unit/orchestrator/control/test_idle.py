@@ -84,7 +84,7 @@ def ticks(bench: FakeController[FakeEngine], condition: Callable[[], bool]) -> N
     """Make passes until the condition holds."""
 
     def there() -> bool:
-        bench.controller.reconciler.tick()
+        bench.controller.tick()
         return condition()
 
     wait_for(there, 30, "the state")
@@ -98,7 +98,7 @@ def test_a_pass_in_which_nothing_changed_reads_and_writes_nothing(
 
     def passes() -> None:
         for _ in range(10):
-            controller.controller.reconciler.tick()
+            controller.controller.tick()
         ticks(controller, lambda: controller.engine.looks > looks + 2)  # the engine is looked at all the same
 
     costs.watched(passes)
@@ -113,7 +113,7 @@ def test_a_job_that_waits_costs_nothing_between_two_scheduling_passes(
     controller.submit("large", node_properties=properties(4))
     passed = controller.controller.admission._passed
     ticks(controller, lambda: controller.controller.admission._passed[0] > passed[0])
-    costs.watched(controller.controller.reconciler.tick)
+    costs.watched(controller.controller.tick)
     assert (costs.statements, costs.store, costs.files) == ([], [], [])
 
 

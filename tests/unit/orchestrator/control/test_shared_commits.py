@@ -33,7 +33,7 @@ def ticks(bench: Bench, condition: Callable[[], bool]) -> None:
     """Make passes until the condition holds."""
 
     def there() -> bool:
-        bench.controller.reconciler.tick()
+        bench.controller.tick()
         return condition()
 
     wait_for(there, 30, "the state")
@@ -112,14 +112,14 @@ def test_an_attempt_whose_end_was_committed_without_an_answer_is_forgotten(
 
     def passed() -> bool:
         try:
-            bench.controller.reconciler.tick()
+            bench.controller.tick()
         except DatabaseError as error:
-            bench.controller.reconciler._isolation.trouble = str(error)
+            bench.controller._isolation.trouble = str(error)
         with bench.database.session() as session:
             return bool(lost) and session.get_one(Job, "one").status == Status.SUCCEEDED
 
     wait_for(passed, 30, "the end")
-    bench.controller.reconciler.tick()
+    bench.controller.tick()
     attempts = bench.controller.attempts
     assert list(attempts._open) == ["two"]
     [runner] = attempts.engine._runners.values()

@@ -78,7 +78,7 @@ def test_why_a_gang_can_not_be_stopped_stays_its_reason_at_every_further_try(
         bench = FakeController(tmp_path, FakeEngine(capacity=Hosts([Host("fake/host", 8.0, (), 8192)])), stack)
 
         def ticked(done: bool) -> bool:
-            bench.controller.reconciler.tick()
+            bench.controller.tick()
             return done
 
         bench.submit("a")
