@@ -58,7 +58,7 @@ class Admission:
         """Of the last pass: the version of the work queue, when it began, and the seconds that it took."""
         self._pass_interval = _PASS_INTERVAL
 
-    def look(self) -> None:
+    def schedule(self) -> None:
         """Make a scheduling pass, where something changed or time has passed, and enough space is free."""
         shortage = self._disk.shortage()
         if self._short != (shortage is not None):

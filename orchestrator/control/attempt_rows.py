@@ -33,7 +33,7 @@ NO_EPOCH = 0
 def state_of(job: Job, attempt: Attempt) -> AttemptState:
     """The state of an attempt, by its rows: all but what only a controller's memory has."""
     gang = job.gang
-    spent = [each for each in job.attempts if each.spent and each is not attempt]
+    counted = [each for each in job.attempts if each.spent and each is not attempt]
     terms = Terms(
         number=attempt.number,
         hosts=[node.host for node in attempt.nodes],
@@ -43,10 +43,10 @@ def state_of(job: Job, attempt: Attempt) -> AttemptState:
         grace=GRACE,
         timeout=job.timeout,
         allowed=job.attempts_allowed,
-        spent=len(spent),
+        spent=len(counted),
         conditions=job.evaluate_on_exit,
         cancelled=sum(each.ending == Ending.CANCELLED for each in job.attempts if each is not attempt),
-        last_fault=spent[-1].fault if spent else None,
+        last_fault=counted[-1].fault if counted else None,
     )
     verdict = None
     if attempt.ending is not None:
@@ -80,15 +80,15 @@ class SharedRows:
     def __init__(self, session: Session, jobs: Sequence[Job]) -> None:
         self._session, self._jobs = session, jobs
 
-    def _read(self, wanted: Select[_Row]) -> Iterable[_Row]:
+    def _read(self, query: Select[_Row]) -> Iterable[_Row]:
         """Rows as they are now: the session may have some of before, which requests have changed since."""
-        return self._session.scalars(wanted, execution_options={"populate_existing": True})
+        return self._session.scalars(query, execution_options={"populate_existing": True})
 
     @cached_property
     def queues(self) -> dict[str, JobQueue]:
         """By name."""
-        wanted = select(JobQueue).where(JobQueue.name.in_({job.queue for job in self._jobs}))
-        return {each.name: each for each in self._read(wanted)}
+        query = select(JobQueue).where(JobQueue.name.in_({job.queue for job in self._jobs}))
+        return {each.name: each for each in self._read(query)}
 
     @cached_property
     def _environments(self) -> dict[str, ComputeEnvironment]:
@@ -110,14 +110,14 @@ class SharedRows:
     @cached_property
     def runs(self) -> dict[str, RunRecord]:
         """The owners of the jobs' runs, by name; a record that is added belongs here, too."""
-        wanted = select(RunRecord).where(RunRecord.name.in_({job.run for job in self._jobs}))
-        return {each.name: each for each in self._session.scalars(wanted)}
+        query = select(RunRecord).where(RunRecord.name.in_({job.run for job in self._jobs}))
+        return {each.name: each for each in self._session.scalars(query)}
 
     @cached_property
     def _epochs(self) -> dict[str, list[int]]:
         found: dict[str, list[int]] = defaultdict(list)
-        wanted = select(Job.run, Attempt.epoch).join(Attempt).where(Job.run.in_({job.run for job in self._jobs}))
-        for run, epoch in self._session.execute(wanted):
+        query = select(Job.run, Attempt.epoch).join(Attempt).where(Job.run.in_({job.run for job in self._jobs}))
+        for run, epoch in self._session.execute(query):
             found[run].append(epoch)
         return found
 

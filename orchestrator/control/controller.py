@@ -187,7 +187,7 @@ class Controller:
         self.engines.look()
         self._look_at_gangs()
         self._note_silence()
-        self._isolation.part("scheduling", self.admission.look)
+        self._isolation.part("scheduling", self.admission.schedule)
         self._isolation.part("clearing away", self._clear_away)
 
     def _look_at_gangs(self) -> None:
@@ -262,4 +262,4 @@ class Controller:
 
     def _clear_away(self) -> None:
         self._isolation.backoff.tidy()
-        self.upkeep.look()
+        self.upkeep.run()

@@ -102,7 +102,7 @@ class Disk:
         of = (volume for volume in self._volumes if purpose in (None, volume.name))
         return next((why for volume in of if (why := self._silence(volume) or volume.absent or volume.short)), None)
 
-    def away(self, purpose: str) -> str | None:
+    def unavailable(self, purpose: str) -> str | None:
         """Why the volume of this purpose can't be read: it has not answered for a while, or is not there; None where it can, as far as was seen."""
         return next((self._silence(each) or each.absent for each in self._volumes if each.name == purpose), None)
 

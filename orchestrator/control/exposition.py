@@ -118,7 +118,7 @@ class _Moment(CollectorRegistry):
     def _hosts(self) -> Iterator[GaugeMetricFamily]:
         hosts, gpus, cpus = _Sums(float), _Sums(float), _Sums(float)
         for name, capacity in self._controller.engines.capacity().items():
-            for host in [host for host in capacity.places if not host.away]:
+            for host in [host for host in capacity.places if not host.unavailable]:
                 if not host.queue:
                     hosts[(name,)] += 1
                 gpus[(name,)] += len(host.gpus)

@@ -69,8 +69,8 @@ class Isolation:
             with self._loaded.session() as session:
                 jobs = self._loaded.jobs(session, ids)
                 self.before(session, list(jobs.values()))
-                begun = [body(session, job) for job in jobs.values()]
-                self._finish(session, [steps for steps in begun if steps is not None])
+                started = [body(session, job) for job in jobs.values()]
+                self._finish(session, [steps for steps in started if steps is not None])
         except DatabaseError:
             raise
         except Exception as error:

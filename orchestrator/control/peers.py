@@ -74,7 +74,7 @@ class Peers:
         self._ending.set()
         if self._thread is not None:
             self._thread.join(BEAT)
-        with contextlib.suppress(OSError):  # a volume that is away: the heartbeat goes out of date
+        with contextlib.suppress(OSError):  # an unavailable volume: the heartbeat goes out of date
             self._path.unlink(missing_ok=True)
 
     def writer(self, run: Run) -> str | None:

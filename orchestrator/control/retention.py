@@ -22,7 +22,7 @@ from sqlalchemy import or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.retention_facts import CONTROLLER, PassTotals, Requester, RetentionStep, Step, StoredRuns
+from orchestrator.control.retention_facts import CONTROLLER, PassTotals, Requester, RetentionPlan, Step, StoredRuns
 from orchestrator.control.store_access import StoreAccess
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
@@ -173,8 +173,8 @@ class Retention:
         totals, place = PassTotals(), Cursor()
         while not self._is_closing.is_set():
             began = machine.processor_time()
-            looks, following = step(self.rules(), place)
-            totals.add(looks)
+            plans, following = step(self.rules(), place)
+            totals.add(plans)
             if following is None:
                 break
             place = following
@@ -215,7 +215,7 @@ class Retention:
         Args:
             after: Where the step before ended.
             rules: As :meth:`rules` answers, or changed.
-            take: Take it; else only look.
+            take: Take it; else only plan.
             by: Who requests it.
             most: Number of jobs.
 
@@ -233,14 +233,14 @@ class Retention:
                 query = query.where(Job.owner == by.name, Job.queue.in_(by.queues))
             # of equal times an array behind its children
             found = session.execute(query.order_by(Job.stopped_at, Job.id.desc()).limit(most)).all()
-        looks = self._looks({row.run for row in found if NAME.fullmatch(row.run)}, rules, moment, by)
-        wanted = [look.run for look in looks if look.decision.jobs]
-        described = {look.run: look.described() for look in looks if not take or look.decision.reasons}
-        if take and wanted:
-            taken = self._take(wanted)
+        plans = self._plans({row.run for row in found if NAME.fullmatch(row.run)}, rules, moment, by)
+        going = [plan.run for plan in plans if plan.decision.jobs]
+        described = {plan.run: plan.described() for plan in plans if not take or plan.decision.reasons}
+        if take and going:
+            taken = self._take(going)
             try:
-                again = self._looks(taken, rules, moment, by)
-                described |= {look.run: look.described() for look in again}
+                again = self._plans(taken, rules, moment, by)
+                described |= {plan.run: plan.described() for plan in again}
                 gone, stay = self._carry_out(again)
                 for run, why in stay.items():
                     described[run] |= {"whole": False, "kept": [why]}
@@ -259,7 +259,7 @@ class Retention:
         with self._writing:
             return [run for run in runs if run not in self._beginning and self._users.take(run)]
 
-    def _looks(self, runs: Collection[str], rules: RetentionRules, moment: int, by: Requester) -> list[RetentionStep]:
+    def _plans(self, runs: Collection[str], rules: RetentionRules, moment: int, by: Requester) -> list[RetentionPlan]:
         """What may go of these runs and their jobs. Raises Unavailable, OSError."""
         if not runs:
             return []
@@ -269,7 +269,7 @@ class Retention:
             jobs = self._jobs(session, runs, rules, moment, by)
             needed = References.of(rows.references(session, runs)) | stored
         needed = needed if by.queues is None else needed.unnamed()
-        return [self._look(run, facts[run], jobs[run], needed) for run in sorted(runs)]
+        return [self._plan(run, facts[run], jobs[run], needed) for run in sorted(runs)]
 
     def _jobs(
         self, session: Session, runs: Collection[str], rules: RetentionRules, moment: int, by: Requester
@@ -287,35 +287,35 @@ class Retention:
             for run, of_run in jobs.items()
         }
 
-    def _look(self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References) -> RetentionStep:
+    def _plan(self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References) -> RetentionPlan:
         decision, run = decide(facts, jobs, needed), self._store.run(name)
         if decision.run:
-            return RetentionStep(name, decision, facts, (run.path,))
-        return RetentionStep(
+            return RetentionPlan(name, decision, facts, (run.path,))
+        return RetentionPlan(
             name, decision, facts, tuple(path for job in decision.jobs for path in contents.job_directories(run, job))
         )
 
-    def _carry_out(self, looks: Sequence[RetentionStep]) -> tuple[Collection[str], Mapping[str, str]]:
+    def _carry_out(self, plans: Sequence[RetentionPlan]) -> tuple[Collection[str], Mapping[str, str]]:
         """Move into the trash what goes, delete the rows, and empty the trash.
 
         Returns the jobs that went, and why something of a run stays, by run. Raises Unavailable, OSError.
         """
-        unchanged, stay, gone = list[RetentionStep](), dict[str, str](), set[str]()
+        unchanged, stay, gone = list[RetentionPlan](), dict[str, str](), set[str]()
         self.stored.check()
-        thrown, fixed = trash.throw_away(self._store, self._directories(looks, unchanged, stay))
+        thrown, fixed = trash.throw_away(self._store, self._directories(plans, unchanged, stay))
         self.stored.check()
         self._fixed |= fixed
         going = list[str]()
-        for look in unchanged:
-            held = [path for path in look.directories if path in fixed]
+        for plan in unchanged:
+            held = [path for path in plan.directories if path in fixed]
             if held:
-                stay[look.run] = _unmoved(fixed[held[0]])
-            if not (held and look.decision.run):
-                going += set(look.decision.jobs) - {path.name for path in held}
+                stay[plan.run] = _unmoved(fixed[held[0]])
+            if not (held and plan.decision.run):
+                going += set(plan.decision.jobs) - {path.name for path in held}
         if self._is_closing.is_set():
             return gone, stay  # the next controller deletes the rows
         going.sort(key=lambda job: ":" not in job)  # an array behind its children
-        runs = [look.run for look in unchanged if look.run not in stay and (look.decision.run or look.facts is None)]
+        runs = [plan.run for plan in unchanged if plan.run not in stay and (plan.decision.run or plan.facts is None)]
         for start in range(0, len(going), A_TRANSACTION):
             with self._writing, self._database.session() as session:
                 gone |= rows.forget_jobs(session, going[start : start + A_TRANSACTION])
@@ -325,19 +325,19 @@ class Retention:
         return gone, stay
 
     def _directories(
-        self, looks: Sequence[RetentionStep], unchanged: list[RetentionStep], stay: dict[str, str]
+        self, plans: Sequence[RetentionPlan], unchanged: list[RetentionPlan], stay: dict[str, str]
     ) -> Iterator[Path]:
         """The directories that go. Each run is read again right before: since it was looked at, another controller may have begun an
         attempt of it, which no lock of this one keeps out.
         """
-        for look in looks:
-            if not look.decision.jobs:
+        for plan in plans:
+            if not plan.decision.jobs:
                 continue
-            if self.stored.is_unchanged(look.run, look.facts):
-                unchanged.append(look)
-                yield from look.directories
+            if self.stored.is_unchanged(plan.run, plan.facts):
+                unchanged.append(plan)
+                yield from plan.directories
             else:
-                stay[look.run] = "it has just changed"
+                stay[plan.run] = "it has just changed"
 
     def _remove(self, thrown: Sequence[Path]) -> None:
         """Remove what was thrown away, several at once: each waits for the file system's journal."""

@@ -35,7 +35,7 @@ CONTROLLER = Requester("this controller")
 
 
 @dataclass(frozen=True)
-class RetentionStep:
+class RetentionPlan:
     """What a step does, or would do, with a run and its jobs."""
 
     run: str
@@ -78,11 +78,11 @@ class PassTotals:
 
 
 Step = tuple[list[dict[str, Any]], Cursor | None]
-"""What a step has found, as :meth:`RetentionStep.described`, and where the next one begins."""
+"""What a step has found, as :meth:`RetentionPlan.described`, and where the next one begins."""
 
 
 class StoredRuns:
-    """Of one store. Any thread may call; all but :meth:`look_again` may wait for the store."""
+    """Of one store. Any thread may call; all but :meth:`refresh` may wait for the store."""
 
     def __init__(self, store: Store, peers: Peers, check: Callable[[], None]) -> None:
         """
@@ -135,7 +135,7 @@ class StoredRuns:
                 self._found = found, began, version
             return self._found[0]
 
-    def look_again(self) -> None:
+    def refresh(self) -> None:
         """Something in the store needs other runs than before. Waits for nothing."""
         self._version += 1
 

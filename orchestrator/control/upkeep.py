@@ -17,7 +17,7 @@ from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
 
 INTERVAL = 2.0
-"""Seconds between two looks."""
+"""Seconds between two runs."""
 
 
 class Upkeep:
@@ -34,7 +34,7 @@ class Upkeep:
     ) -> None:
         self._database, self._writes, self._access = database, writes, access
         self._texts, self._retention, self._monitoring = texts, retention, monitoring
-        self._looked = 0.0
+        self._ran = 0.0
         self._is_draining = True
         """Whether a deleted queue may still be there."""
 
@@ -43,12 +43,12 @@ class Upkeep:
         self._is_draining = True
         ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
 
-    def look(self) -> None:
+    def run(self) -> None:
         """Clear away what is due."""
-        if machine.monotonic() - self._looked < INTERVAL or not self._writes.lock.acquire(blocking=False):
+        if machine.monotonic() - self._ran < INTERVAL or not self._writes.lock.acquire(blocking=False):
             return  # somebody writes: gangs must not wait for that
         try:
-            self._looked = machine.monotonic()
+            self._ran = machine.monotonic()
             self._delete_queues()
             self._texts.sweep_when_due(self._access.calls.later)
             self._retention.when_due(self._access.calls.later)

@@ -34,9 +34,9 @@ from orchestrator.domain.job import (
     judge,
     judge_as_aws,
     lost_host,
+    retries,
 )
 from orchestrator.domain.native_options import NativeOptions
-from orchestrator.domain.retry import retries
 from shared_store.contract.error_text import counted
 
 UNHEARD = 10.0

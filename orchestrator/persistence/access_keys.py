@@ -114,15 +114,15 @@ class KeyStore:
             self._look()
         return self._keys
 
-    def look_again(self) -> None:
+    def refresh(self) -> None:
         """Look for a key that another process may just have made; callers who wait for the same look share it.
 
         Where the database does not answer in time, what was read last stays in force.
         """
-        asked = machine.monotonic()
+        requested = machine.monotonic()
         if self._looking.acquire(timeout=PATIENCE):
             try:
-                if self._looked <= asked:
+                if self._looked <= requested:
                     self._look_safely()
             finally:
                 self._looking.release()
@@ -194,9 +194,9 @@ class KeyStore:
         """Delete a key: this process refuses it from its next request on, others within a second. Raises KeyUsageError, DatabaseError."""
         with self._database.session() as session:
             deleted = session.execute(delete(AccessKey).where(AccessKey.name == name).returning(AccessKey.name)).all()
-        there = ", ".join(each.name for each in self.load().values()) or "no key"
+        present = ", ".join(each.name for each in self.load().values()) or "no key"
         if not deleted:
-            raise KeyUsageError(f"there is no key {name!r}; there is {there}")
+            raise KeyUsageError(f"there is no key {name!r}; there is {present}")
 
     def _loop(self) -> None:
         while not self._ending.wait(INTERVAL):

@@ -140,7 +140,7 @@ class Database:
 
     @classmethod
     def at(cls, home: Path, other: str | None = None, *, beside: bool = False) -> Database:
-        """The database of a Muster home directory: its SQLite file, or the ``other`` that its controller is given, a URL or a path."""
+        """The database of a Muster home directory: its SQLite file, or the ``other`` that its controller uses, a URL or a path."""
         return cls(database_url(home, other), beside=beside)
 
     @contextmanager
@@ -377,7 +377,7 @@ class _Session(Session):
 
 
 @event.listens_for(_Session, "after_commit")
-def _tell(session: Session) -> None:
+def _report_commit(session: Session) -> None:
     jobs, ids = session.info.pop("jobs", None), session.info.pop("ids", None)
     database = session.info["database"]
     database.counts.add(session.info.pop("counts", {}))

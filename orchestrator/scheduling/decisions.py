@@ -111,7 +111,8 @@ class _Pass:
             self._serve([self._line(queues[name], jobs[name]) for name in equal])
         for name in jobs.keys() - queues.keys():
             self.orders[name] = QueueOrder(dispatch_order(None, jobs[name], {}, RoundRobin(), bool), None)
-        report = WaitReport(self.now, self.orders, self.reservations, self.free, self.preempts, self.snapshot.drift)
+        preempted = {each.job for each in self.preempts}
+        report = WaitReport(self.now, self.orders, self.reservations, self.free, preempted, self.snapshot.drift)
         return Decisions(
             tuple(self.starts),
             tuple(self.preempts),

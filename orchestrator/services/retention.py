@@ -77,7 +77,7 @@ def next_part(controller: Controller, actor: Actor, after: str, older_than: str,
     except ValueError as error:
         raise ClientError(f"older_than: {error}") from None
     if not after:
-        controller.retention.stored.look_again()  # others may have changed the store
+        controller.retention.stored.refresh()  # others may have changed the store
     found: list[dict[str, Any]] = []
     deadline = time.monotonic() + _A_PART
     while True:

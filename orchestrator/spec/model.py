@@ -102,7 +102,7 @@ class _Train(Section):
         written: dict[str, Any] = write(self)
         return {name: value for name, value in written.items() if name not in others}
 
-    def given(self) -> dict[str, Any]:
+    def overrides(self) -> dict[str, Any]:
         """The algorithm's settings that the job gives."""
         if self.section == "settings":
             return self.settings
@@ -210,20 +210,20 @@ class _Spec(Section):
     @classmethod
     def _no_second_kind(cls, document: Any) -> Any:
         """Checked first: other errors in a section that should not exist help nobody."""
-        given = [kind for kind in KINDS if document.get(kind) is not None] if isinstance(document, Mapping) else []
-        if len(given) > 1:
-            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found {' and '.join(given)}")
+        names = [kind for kind in KINDS if document.get(kind) is not None] if isinstance(document, Mapping) else []
+        if len(names) > 1:
+            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found {' and '.join(names)}")
         return document
 
     @model_validator(mode="after")
     def _one_kind(self) -> _Spec:
-        given = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if not given:
+        names = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if not names:
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found none")
         if self.evaluation is not None and self.train is None:
-            raise ValueError(f"evaluation is for jobs that train, not for {given[0]}")
-        if given[0] in plugins.sections() and (self.nodes.max > 1 or self.resources.gpus > 1):
-            raise ValueError(f"{given[0]}: it runs on one node with at most one GPU")
+            raise ValueError(f"evaluation is for jobs that train, not for {names[0]}")
+        if names[0] in plugins.sections() and (self.nodes.max > 1 or self.resources.gpus > 1):
+            raise ValueError(f"{names[0]}: it runs on one node with at most one GPU")
         return self
 
     @model_validator(mode="after")
@@ -358,9 +358,9 @@ def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
 
 def _of_another_algorithm(train: _Train) -> Problem | None:
     """Settings of an algorithm that is not the chosen one would change nothing."""
-    given = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(train, name)).values())]
-    given += ["settings"] if train.settings else []
-    for name in given:
+    names = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(train, name)).values())]
+    names += ["settings"] if train.settings else []
+    for name in names:
         if name != train.section:
             words = f"the algorithm is {train.algorithm}, so its settings belong under train.{train.section}"
             return ("train", name), words
@@ -380,7 +380,7 @@ def _problem_of(train: _Train) -> Problem | None:
             path, words = problem
             return ("train", "config", *path), words
         if settings := ALGORITHMS.get(train.algorithm):
-            problem = effective_problem(settings, train.algorithm, kind.configured(train.config), train.given())
+            problem = effective_problem(settings, train.algorithm, kind.configured(train.config), train.overrides())
             if problem:
                 path, words = problem
                 return ("train", train.algorithm, *path), words

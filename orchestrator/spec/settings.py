@@ -51,7 +51,7 @@ def task_config(task: str) -> Any | None:
 
 
 def effective_problem(
-    settings: Any, name: str, config: Any, given: Mapping[str, Any]
+    settings: Any, name: str, config: Any, overrides: Mapping[str, Any]
 ) -> tuple[tuple[str | int, ...], str] | None:
     """The first problem of an algorithm's settings as its rank puts them together; None where there is none.
 
@@ -59,7 +59,7 @@ def effective_problem(
         settings: Class of the settings.
         name: Of the algorithm.
         config: The task's configuration, whose field of that name has the task's own settings.
-        given: By the job, in place of the task's.
+        overrides: By the job, in place of the task's.
 
     Returns:
         Keys to the value, and one line.
@@ -67,7 +67,7 @@ def effective_problem(
     own = getattr(config, name, None)
     base = {item.name: getattr(own, item.name) for item in fields(own) if item.init} if own is not None else {}
     try:
-        made = settings(**{**base, **given})
+        made = settings(**{**base, **overrides})
         if hasattr(made, "check_observations"):
             made.check_observations(config.observation_groups)
         if hasattr(made, "check_actions"):

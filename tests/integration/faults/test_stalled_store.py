@@ -152,7 +152,7 @@ def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Serv
 
 def test_a_store_whose_volume_is_known_to_be_silent_is_not_even_tried(server: Server) -> None:
     with stalled(server.store.path):
-        wait_for(lambda: server.controller.access.disk.away("store"), 60, "that the volume is silent")
+        wait_for(lambda: server.controller.access.disk.unavailable("store"), 60, "that the volume is silent")
         answer = asked(server, "/api/runs")
         assert answer.status_code == 503 and "has not answered since" in answer.json()["message"]
         assert asked(server, "/api/jobs").status_code == 200
@@ -175,7 +175,7 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
                 "what is missing is not taken for deleted meanwhile"
             )
             # the look before may have found the path empty
-            wait_for(lambda: said in (server.controller.access.disk.away("store") or ""), 60, "that it is seen")
+            wait_for(lambda: said in (server.controller.access.disk.unavailable("store") or ""), 60, "that it is seen")
             answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/models", "/runs/taught")]
             for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
                 body = {"name": "copied"}

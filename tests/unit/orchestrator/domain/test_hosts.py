@@ -18,7 +18,7 @@ def test_a_host_and_a_placement_have_an_amount_of_each_kind() -> None:
     assert Placement("ray/a", ("1",), 0.5, 64).resources == Resources(0.5, 1, 64)
     assert MACHINE.left(1, ("1",), 24) == Host("ray/a", 1, ("1",), 24)
     assert Resources(EPSILON) <= Resources(0) and not Resources(2 * EPSILON) <= Resources(0)
-    assert not (MACHINE.single or MACHINE.away or MACHINE.queue or MACHINE.machine)
+    assert not (MACHINE.single or MACHINE.unavailable or MACHINE.queue or MACHINE.machine)
 
 
 def test_gangs_are_placed_on_machines_where_they_are_known_and_else_on_the_limit_of_the_queue() -> None:

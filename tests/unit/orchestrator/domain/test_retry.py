@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from orchestrator.domain.retry import retries
+from orchestrator.domain.job import retries
 
 EXIT, RETRY = {"action": "EXIT"}, {"action": "retry"}
 

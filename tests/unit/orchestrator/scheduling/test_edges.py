@@ -171,10 +171,12 @@ def test_what_is_reserved_on_other_hosts_is_nothing_to_a_queue() -> None:
 
 
 def test_hosts_that_are_away_are_taken_for_the_smallest_gang_alone() -> None:
-    away, there = replace(host("a", 1), away=True), host("b", 1)
+    away, there = replace(host("a", 1), unavailable=True), host("b", 1)
 
     def where(most: int | None, minimum: int = 2, count: int = 3) -> str | None:
-        found = place(gang(*[node()] * count, minimum=minimum), [away, there, replace(host("c", 1), away=True)], most)
+        found = place(
+            gang(*[node()] * count, minimum=minimum), [away, there, replace(host("c", 1), unavailable=True)], most
+        )
         return found and " ".join(each.host for each in found)
 
     assert [where(most) for most in (None, 3, 2, 1)] == ["b a", "b a", "b a", None]

@@ -187,7 +187,7 @@ def accepted_value(name: str, key: str) -> str:
         except Exception:
             continue
         assert spec.train is not None
-        if spec.train.given().get(key) is not None:
+        if spec.train.overrides().get(key) is not None:
             return probe
     raise AssertionError(f"no probe is a value of train.{name}.{key}: add one")
 
