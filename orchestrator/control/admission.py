@@ -98,7 +98,7 @@ class Admission:
         self._report, self._leading, self._turns = decisions.report, decisions.leading, decisions.turns
         took = machine.monotonic() - started
         self._passed = (version, started, took)
-        self._monitoring.pass_took(took)
+        self._monitoring.passes.observe(took)
         self._carry_out(decisions)
 
     def _carry_out(self, decisions: Decisions) -> None:

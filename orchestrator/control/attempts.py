@@ -215,7 +215,11 @@ class Attempts:
                 if job.status_reason != reason:
                     job.status_reason = reason
             case do.MarkRunning(reason, moment):
-                self._mark_running(session, job, attempt, reason, moment)
+                job.started_at = attempt.started_at = now()
+                attempt.running_since = moment
+                if (array := session.get(Job, job.parent) if job.parent else None) and array.started_at is None:
+                    array.started_at = job.started_at
+                job.move(Status.RUNNING, reason)
             case do.Decide(verdict):
                 attempt.ending, attempt.status_reason = verdict.ending, verdict.reason
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
@@ -267,7 +271,7 @@ class Attempts:
             gang = self.gang(job, attempt, job.gang, self._rows.options(attempt.environment, job.queue))
             return self.engine.plan(self.engine.with_secrets(gang))
 
-        self.bus.expect(job.id, attempt.number, len(attempt.nodes))
+        self.bus.presence.expect(job.id, attempt.number, len(attempt.nodes))
         try:
             return Launched(self.engine.launch(_name(attempt), [node.host for node in attempt.nodes], plan, again))
         except NotYet as wait:
@@ -309,14 +313,6 @@ class Attempts:
             options=options,
             notes=notes_of(job, attempt),
         )
-
-    @staticmethod
-    def _mark_running(session: Session, job: Job, attempt: Attempt, reason: str, moment: int) -> None:
-        job.started_at = attempt.started_at = now()
-        attempt.running_since = moment
-        if (array := session.get(Job, job.parent) if job.parent else None) and array.started_at is None:
-            array.started_at = job.started_at
-        job.move(Status.RUNNING, reason)
 
     def _stop(self, job: Job, attempt: Attempt, opened: _Open, stop: do.Stop) -> Gone | Delayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
@@ -396,16 +392,13 @@ class Attempts:
             log.warning("job %s: %s", job.id, close.reason)
         charge(attempt, opened.progress.saved if opened.progress else None, close.moment)
         opened.uncommitted.append(self.monitoring.ended(job, attempt))
-        self._charge_share(session, job, attempt, close.moment)
+        if (policy := self._rows.policy(job.queue)) is not None:
+            decay, seconds = policy.fairshare.get("shareDecaySeconds"), resource_seconds(attempt, close.moment)
+            add_usage(session, job.queue, job.share or "", seconds, decay or DEFAULT_DECAY, close.moment)
         job.move(close.status, close.reason)
         if job.stopped_at is not None:
             job.stopped_at = max(job.stopped_at, attempt.stopped_at)
         return closed
-
-    def _charge_share(self, session: Session, job: Job, attempt: Attempt, moment: int) -> None:
-        if (policy := self._rows.policy(job.queue)) is not None:
-            decay = policy.fairshare.get("shareDecaySeconds") or DEFAULT_DECAY
-            add_usage(session, job.queue, job.share or "", resource_seconds(attempt, moment), decay, moment)
 
 
 def _is_open(job: Job, attempt: Attempt) -> bool:

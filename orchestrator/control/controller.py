@@ -33,7 +33,7 @@ from orchestrator.control.upkeep import INTERVAL, Upkeep
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.control.writes import Writes
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.batch_models import Attempt, Job
+from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.session import Database
 from shared_store.volume.layout import Store
 
@@ -165,7 +165,7 @@ class Controller:
             self._pass()
         finally:
             self._ticking = None
-            self.monitoring.loop_took(machine.monotonic() - started)
+            self.monitoring.loop.observe(machine.monotonic() - started)
 
     def _pass(self) -> None:
         self.database.reserve_connections()
@@ -186,7 +186,10 @@ class Controller:
             self._loaded.keep(self.work_queue.active())
         self.engines.look()
         self._look_at_gangs()
-        self._note_silence()
+        why = self.bus.presence.cut_off
+        if (why is not None) != self._is_cut_off:
+            self._is_cut_off = why is not None
+            log.warning("%s", f"{why}: no gang ends for it" if why else "nodes are heard again")
         self._isolation.part("scheduling", self.admission.schedule)
         self._isolation.part("clearing away", self._clear_away)
 
@@ -198,12 +201,6 @@ class Controller:
         finally:
             for job_id in active:
                 self.work_queue.later(job_id, machine.monotonic() + _SOON)
-
-    def _note_silence(self) -> None:
-        why = self.bus.presence.cut_off
-        if (why is not None) != self._is_cut_off:
-            self._is_cut_off = why is not None
-            log.warning("%s", f"{why}: no gang ends for it" if why else "nodes are heard again")
 
     def _keep_database(self) -> None:
         """Check the database, and read the jobs anew where it is back. Raises DatabaseError where it is unavailable or another controller's."""
@@ -230,14 +227,12 @@ class Controller:
             self.bus.forget(*closed)
         for key in found.keys() - expected:
             nodes = found[key].nodes
-            self.bus.expect(*key, len(nodes), [node.index for node in nodes if node.met])
+            self.bus.presence.expect(*key, len(nodes), [node.index for node in nodes if node.met])
 
-    def _advance(self, session: Session, job: Job) -> Steps | None:
-        return None if (attempt := job.open_attempt) is None else self._look_at(session, job, attempt)
-
-    def _look_at(self, session: Session, job: Job, attempt: Attempt) -> Steps:
-        yield from self.attempts.advance(session, job, attempt)
-        self.work_queue.later(job.id, machine.monotonic() + self.attempts.pause(job, attempt))
+    def _advance(self, session: Session, job: Job) -> Steps:
+        if (attempt := job.open_attempt) is not None:
+            yield from self.attempts.advance(session, job, attempt)
+            self.work_queue.later(job.id, machine.monotonic() + self.attempts.pause(job, attempt))
 
     def _committed(self, jobs: Sequence[Job]) -> None:
         """Note the jobs of a commit as they are, where this thread has made it; read them again after a commit of a request."""

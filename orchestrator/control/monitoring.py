@@ -28,9 +28,9 @@ class Monitoring:
         self.registry = CollectorRegistry()
         waits, passes = "From the submission of a job to its first attempt.", "Length of a scheduling pass."
         self._waits = Histogram("muster_queue_wait_seconds", waits, ["queue"], buckets=_WAITS, registry=self.registry)
-        self._passes = Histogram("muster_scheduling_pass_seconds", passes, buckets=_PASSES, registry=self.registry)
+        self.passes = Histogram("muster_scheduling_pass_seconds", passes, buckets=_PASSES, registry=self.registry)
         loop = "Length of a pass of the controller's loop."
-        self._loop = Histogram("muster_loop_seconds", loop, buckets=_PASSES, registry=self.registry)
+        self.loop = Histogram("muster_loop_seconds", loop, buckets=_PASSES, registry=self.registry)
         self._restarts = self._counter("restarts", "Attempts that were begun after a job's first one.", *USED)
         self._attempts = self._counter("attempts_ended", "Attempts that ended, by how.", *USED, "ending")
         tries = "Tries to deliver a message about a job's end, by what came of it."
@@ -67,14 +67,6 @@ class Monitoring:
         """A queue was deleted: its series end, lest they grow with every queue that ever was."""
         for metric in (self._waits, self._restarts, self._attempts, *self._seconds.values(), *self._lost.values()):
             metric.remove_by_labels({"queue": queue})
-
-    def pass_took(self, seconds: float) -> None:
-        """A scheduling pass was made."""
-        self._passes.observe(seconds)
-
-    def loop_took(self, seconds: float) -> None:
-        """The loop has made a pass."""
-        self._loop.observe(seconds)
 
     def webhook_tried(self, webhook: str, result: str) -> None:
         """A message was ``delivered``, has ``failed`` and is tried again, or was ``given up``."""

@@ -88,14 +88,11 @@ class Peers:
             return None
         if claim.controller not in self._seen and (found := self._read(claim.controller)):
             self._note(claim.controller, found)  # it started after the last look
-        if (peer := self._present(claim.controller)) is None:
+        with self._lock:
+            peer, heard = self._seen.get(claim.controller, (None, None))
+        if peer is None or heard is None or machine.monotonic() - heard >= GONE:
             return None
         return f"job {short_id(claim.job)} (attempt {claim.attempt}) of {peer}"
-
-    def _present(self, controller: str) -> Peer | None:
-        with self._lock:
-            peer, heard = self._seen.get(controller, (None, None))
-        return peer if heard is not None and machine.monotonic() - heard < GONE else None
 
     @property
     def _path(self) -> Path:

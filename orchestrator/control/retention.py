@@ -18,7 +18,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import or_, select
+from sqlalchemy import delete, or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
@@ -27,11 +27,11 @@ from orchestrator.control.store_access import StoreAccess
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import JobFacts, References, RetentionRules, RunFacts, decide, still_needed
+from orchestrator.domain.retention import A_DAY, JobFacts, References, RetentionRules, RunFacts, decide, still_needed
 from orchestrator.persistence import retention_rows as rows
 from orchestrator.persistence.batch_models import Job, JobQueue, RunRecord, now
 from orchestrator.persistence.keyset import Cursor, behind
-from orchestrator.persistence.own_models import RetentionStart, RunUse
+from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
 from orchestrator.persistence.session import Database
 from shared_store.contract.error_text import counted
 from shared_store.volume import contents, trash
@@ -52,6 +52,8 @@ _FRESH = 600.0
 """Seconds for which what was found in the store counts: what needs a run that is old enough to go seldom comes."""
 _PATIENCE = 10.0
 """Seconds for which the end of a controller waits for a step."""
+_UNUSED = 90 * A_DAY
+"""Milliseconds after which the use of a share is forgotten."""
 _LOGGED = 24 * 3600.0
 """Seconds between two reports of what would go."""
 
@@ -130,7 +132,8 @@ class Retention:
             return
         self._empty_trash()
         with self._writing, self._database.session() as session:
-            rows.forget_usage(session, self._steady())
+            # of the longest half-life, a week, less than 0.02 % is left
+            session.execute(delete(ShareUsage).where(ShareUsage.as_of < self._steady() - _UNUSED))
         if not self._is_on:
             return
         if self.rules().is_trial(self._moment()):

@@ -117,7 +117,8 @@ class StoredRuns:
             return RunFacts(run.name, damage=str(error)) if is_there(run.path) else None
         except (OSError, ValueError) as error:  # which may be one of this run alone: the volume is checked afterwards
             return RunFacts(run.name, damage=str(error))
-        return RunFacts(run.name, inside.epoch, inside.results, inside.logged, _by_whom(archived), writer)
+        by = None if archived is None else f"by {archived.get('by', 'an unknown key')}"
+        return RunFacts(run.name, inside.epoch, inside.results, inside.logged, by, writer)
 
     def references(self, fresh: float) -> References:
         """What in the store needs runs, as it was at most so many seconds ago. Raises Unavailable."""
@@ -138,7 +139,3 @@ class StoredRuns:
     def refresh(self) -> None:
         """Something in the store needs other runs than before. Waits for nothing."""
         self._version += 1
-
-
-def _by_whom(archived: Mapping[str, Any] | None) -> str | None:
-    return None if archived is None else f"by {archived.get('by', 'an unknown key')}"

@@ -56,26 +56,17 @@ class Upkeep:
             self._writes.lock.release()
 
     def _delete_queues(self) -> None:
+        """Delete the queues that are to go and have no open job."""
         if not self._is_draining:
             return
-        left, deleted = True, list[str]()
-        try:
-            with self._database.session() as session:
-                left, deleted = _delete_drained(session)
-        finally:
-            self._is_draining = left
-        for queue in deleted:
-            self._monitoring.forget_queue(queue)
-
-
-def _delete_drained(session: Session) -> tuple[bool, list[str]]:
-    """Delete the queues that are to go and have no open job; returns whether others are left, and the names of those deleted."""
-    left, deleted = False, list[str]()
-    for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
-        busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
-        if session.scalars(busy).first() is None:
-            session.delete(queue)
-            deleted.append(queue.name)
-        else:
-            left = True
-    return left, deleted
+        deleted = list[str]()
+        with self._database.session() as session:
+            queues = session.scalars(select(JobQueue).where(JobQueue.deleting)).all()
+            for queue in queues:
+                busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
+                if session.scalars(busy).first() is None:
+                    session.delete(queue)
+                    deleted.append(queue.name)
+        self._is_draining = len(deleted) < len(queues)
+        for name in deleted:
+            self._monitoring.forget_queue(name)

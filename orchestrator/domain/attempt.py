@@ -218,14 +218,21 @@ def _judge(state: AttemptState, seen: Observed) -> do.Instructions:
     if state.verdict is not None:
         return ()
     waits: do.Instructions = ()
-    verdict = _by_ends(state.terms, seen.ends) if seen.unread is None else None
+    terms, verdict = state.terms, None
+    if seen.unread is None and terms.options.is_native:
+        verdict = judge(terms.options.on_child_failure, terms.main, seen.ends)
+    elif seen.unread is None:
+        verdict = judge_as_aws(terms.main, seen.ends, terms.hosts[terms.main])
     if verdict is not None and not verdict.certain:
         since = seen.moment if state.cause_since is None else state.cause_since
         if seen.moment - since <= CAUSE_PATIENCE:
             verdict, waits = None, (do.Await("cause_since", since),)
     if verdict is None and state.stop_reason is not None:
         verdict = Verdict(Ending.STOPPED, state.stop_reason)
-    verdict = verdict or _by_silence(state.terms, seen) or _by_time(state, seen.moment)
+    verdict = verdict or _by_silence(terms, seen)
+    ran = seen.moment - (state.running_since or seen.moment)
+    if verdict is None and terms.timeout and ran > terms.timeout * 1000:
+        verdict = Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
     return waits if verdict is None else (*waits, do.Decide(verdict))
 
 
@@ -244,12 +251,6 @@ def _end(state: AttemptState, seen: Observed, *, is_explained: bool) -> do.Instr
     grace = _FAILED_GRACE if verdict.ending in (Ending.FAILED, Ending.FATAL) else state.terms.grace + _MARGIN
     recorded = (do.Save(),) if is_explained else (do.Explain(waits), do.Save())
     return *recorded, do.Stop(grace, waits)
-
-
-def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:
-    if terms.options.is_native:
-        return judge(terms.options.on_child_failure, terms.main, ends)
-    return judge_as_aws(terms.main, ends, terms.hosts[terms.main])
 
 
 def _by_silence(terms: Terms, seen: Observed) -> Verdict | None:
@@ -277,13 +278,6 @@ def _unheard(terms: Terms, seen: Observed) -> str:
                 f" ({silence.cause})" if silence.cause else ""
             )
     return ""
-
-
-def _by_time(state: AttemptState, moment: int) -> Verdict | None:
-    timeout, since = state.terms.timeout, state.running_since
-    if timeout and since and moment - since > timeout * 1000:
-        return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
-    return None
 
 
 def _close(state: AttemptState, verdict: Verdict, gone: Gone) -> do.Close:

@@ -129,7 +129,8 @@ class Database:
             **({} if is_in_memory(parsed) else {"pool_timeout": _POOL_TIMEOUT}),
         )
         if is_sqlite:
-            event.listen(engine, "do_connect", self._check_before_connect)
+            # SQLite would make a new, empty file in place of one that was deleted
+            event.listen(engine, "do_connect", lambda *_: self.check())
             event.listen(engine, "connect", _tune_sqlite)
         return engine
 
@@ -226,10 +227,6 @@ class Database:
     def shown(self) -> str:
         """Its URL, without the password."""
         return shown(str(self.engine.url))
-
-    def _check_before_connect(self, *_: object) -> None:
-        """SQLite would make a new, empty file in place of one that was deleted."""
-        self.check()
 
     def _reserve(self) -> None:
         """Have SQLite own space that no other program on the volume can take: free pages in its file, and a write-ahead log as long as it

@@ -48,16 +48,13 @@ def seconds_of(option: str, text: str | None) -> float | None:
         raise SpecError(f"{option} {text}: {error}") from None
 
 
-def _run_name(value: str) -> str:
-    if not NAME.fullmatch(value):
-        raise ValueError("expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128")
-    return value
+def _name(pattern: re.Pattern[str], signs: str, most: int) -> AfterValidator:
+    def check(value: str) -> str:
+        if not pattern.fullmatch(value):
+            raise ValueError(f"expected letters, digits, {signs}, starting with a letter or digit, at most {most}")
+        return value
 
-
-def _job_name(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}", value):
-        raise ValueError("expected letters, digits, '_' and '-', starting with a letter or digit, at most 100")
-    return value
+    return AfterValidator(check)
 
 
 def task_name(value: str) -> str:
@@ -103,8 +100,8 @@ def known_tasks() -> list[str]:
 Duration = Annotated[float, _amount(SECONDS, _DURATION)]
 Memory = Annotated[int, _amount(BYTES, "an amount of memory such as 512MiB or 4GiB", 2**20)]
 Size = Annotated[int, _amount(BYTES, "a size such as 64MiB or 1GiB", 1)]
-RunName = Annotated[str, AfterValidator(_run_name)]
-JobName = Annotated[str, AfterValidator(_job_name)]
+RunName = Annotated[str, _name(NAME, "'.', '_' and '-'", 128)]
+JobName = Annotated[str, _name(re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}"), "'_' and '-'", 100)]
 TaskName = Annotated[str, AfterValidator(task_name)]
 Environment = Annotated[dict[str, str], AfterValidator(_environment)]
 Secrets = Annotated[dict[str, str], AfterValidator(_secrets)]
