@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -14,11 +13,11 @@ from sqlalchemy import event, func, or_, select
 from sqlalchemy.exc import IntegrityError, OperationalError
 from sqlalchemy.orm import Session
 
+from orchestrator.control.writes import Writes
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.resources import Resources
 from orchestrator.persistence.batch_models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.gangs import Gangs
-from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.ownership import owner_of, record_owner
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
@@ -47,8 +46,9 @@ class Crowd:
     """Callers that all wait while somebody else writes, then are carried out together."""
 
     def __init__(self, home: Path) -> None:
-        self.database, self.writing = Database.at(home), threading.Lock()
-        self.together = GroupCommit(self.database, self.writing)
+        nothing: Any = None  # additions ask neither the disk nor the loop
+        self.database = Database.at(home)
+        self.writes: Any = Writes(self.database, nothing, nothing)
         self.commits = 0
         event.listen(self.database.engine, "commit", self._count)
 
@@ -58,9 +58,9 @@ class Crowd:
     def call(self, *bodies: Callable[[Session], dict[str, Any]]) -> list[Any]:
         """What each call answered or raised."""
         with ThreadPoolExecutor(len(bodies)) as threads:
-            with self.writing:
-                calls = [threads.submit(self.together.call, body) for body in bodies]
-                while len(self.together._waiting) < len(bodies):
+            with self.writes.lock:
+                calls = [threads.submit(self.writes.gather, body) for body in bodies]
+                while len(self.writes._pending) < len(bodies):
                     pass
             return [call.exception() or call.result() for call in calls]
 
