@@ -190,6 +190,11 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     # -- what ends it
     "the main node's end decides": (RUNNING, seen(*MAIN_LAST), ends(DONE)),
     "a failure has little to save": (RUNNING, seen(end(1), None), ends(FAILED, 5.0)),
+    "so has a child's that is final": (
+        with_terms(RUNNING, options=replace(NATIVE, on_child_failure="fail")),
+        seen(None, end(1)),
+        ends(Verdict(Ending.FATAL, "node 1: exit 1", 1), 5.0),
+    ),
     "what was told to end waits for the cause": (RUNNING, seen(KILLED, None), [SAYS_SO, do.Await("cause_since", T)]),
     "since the first time": (
         replace(RUNNING, cause_since=T - CAUSE_PATIENCE),
@@ -294,6 +299,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     ),
     "a stop that fails is told": (ending(Ending.FAILED), Delayed("not allowed"), [do.Explain("not allowed")]),
     "so is a store that can't be read": (RUNNING, Delayed("the store is away"), [do.Explain("the store is away")]),
+    "one that is closed stays so": (replace(ending(Ending.FAILED), closed=True), Gone(T, MAIN_LAST, ""), []),
     "a gang does not go before its end is decided": (RUNNING, Gone(T, MAIN_LAST, ""), []),
 }
 
@@ -371,7 +377,7 @@ CLOSES: dict[str, tuple[AttemptState, Sequence[NodeEnd | None], bool, Status, st
     "done before its time was over": (ending(Ending.TIMEOUT), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
     "stopped with 0 when its time was over": (ending(Ending.TIMEOUT), ASKED_LAST, SPENT, S.FAILED, "why"),
     "done before it was preempted": (ending(Ending.PREEMPTED), MAIN_LAST, FREE, S.SUCCEEDED, DONE_SO),
-    "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=2), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
+    "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=3), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
     "left at once": (AT_ONCE, BOTH_LEFT, SPENT, S.RUNNABLE, LEFT_SO),
     "left at once, the last time": (with_terms(AT_ONCE, spent=2), BOTH_LEFT, SPENT, S.FAILED, "why"),
     "lost": (ending(Ending.LOST), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
