@@ -46,7 +46,7 @@ _READERS = 16
 _CANCELLATIONS = 3
 """How often a job is started again, by default, after others have cancelled it in its engine's own queue."""
 _LEAST, _LATER = 0.02, 60.0
-"""Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
+"""Seconds until an attempt is advanced again: at least, and where nothing is due."""
 
 
 Steps = Generator[Callable[[], None], None, None]
@@ -92,7 +92,7 @@ class Attempts:
         withdrawn: Callable[[str, str], None],
         texts: KeptTexts,
     ) -> None:
-        """``changed``: called, from any thread, with a job whose attempt should be looked at; ``withdrawn``: with one that can't start
+        """``changed``: called, from any thread, with a job whose attempt should be advanced; ``withdrawn``: with one that can't start
         now, and why. ``texts``: of which each run gets those that its job names.
         """
         self.engine, self.runs, self.bus = engine, runs, bus
@@ -129,11 +129,11 @@ class Attempts:
         yield from self._happened(session, job, attempt, opened, Due())
 
     def advance(self, session: Session, job: Job, attempt: Attempt) -> Steps:
-        """One look at an open attempt."""
+        """Observe an open attempt and go on with it."""
         return self._happened(session, job, attempt, self._opened(job, attempt), Due())
 
     def pause(self, job: Job, attempt: Attempt) -> float:
-        """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
+        """Seconds until :meth:`advance`, where no engine, errand, node or request calls for it earlier."""
         if not _is_open(job, attempt):
             return _LATER
         opened = self._opened(job, attempt)
@@ -203,7 +203,7 @@ class Attempts:
             case do.TakeEpoch(epoch):
                 attempt.epoch = epoch
                 waited = attempt.held_since - (job.queued_since or attempt.held_since) if attempt.held_since else 0
-                opened.uncommitted.append(self.monitoring.begun(job, attempt, waited / 1000))
+                opened.uncommitted.append(self.monitoring.started(job, attempt, waited / 1000))
                 job.first_epoch = job.first_epoch or epoch
             case do.Launch(again):
                 return self._launch(job, attempt, again)
@@ -234,7 +234,7 @@ class Attempts:
     def _prepare(
         self, session: Session, job: Job, attempt: Attempt, opened: _Open
     ) -> Prepared | Delayed | Refused | None:
-        """Look at the run, record its owner, then take it."""
+        """Read the run, record its owner, then take it."""
         key = opened.key
         try:
             if opened.run is None:

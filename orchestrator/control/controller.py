@@ -38,13 +38,13 @@ from orchestrator.persistence.session import Database
 from shared_store.volume.layout import Store
 
 _SETTLED_A_TICK = 1000
-"""Jobs that only change their state, in one pass: a large array that ends must not delay the looks at running gangs."""
+"""Jobs that only change their state, in one pass: a large array that ends must not delay running gangs."""
 _GATHERING = 0.02
-"""Seconds between a wake-up and the look: changes that come together cost one commit and one pass."""
+"""Seconds between a wake-up and the pass: changes that come together cost one commit and one pass."""
 _WITHOUT_DATABASE = 1.0
 """Seconds between two tries of a database that can't be used."""
 _SOON = 1.0
-"""Seconds until the next look at a gang after one that failed."""
+"""Seconds until a gang is observed again after a failure."""
 
 log = logging.getLogger("muster.controller")
 
@@ -155,7 +155,7 @@ class Controller:
             self.work_queue.alarm.clear()
 
     def tick(self) -> None:
-        """One pass over every job that needs a look; one that can't be handled now does not hold up the others.
+        """One pass over every job that needs it; one that can't be handled now does not hold up the others.
 
         Raises DatabaseError where the database can't be used; the next pass tries again.
         """
@@ -179,13 +179,13 @@ class Controller:
         due = [job_id for job_id in taken if not self._isolation.backoff.waits(("settle", job_id))]
         self.work_queue.look_again(job_id for job_id in taken if self._isolation.backoff.waits(("settle", job_id)))
         if due and len(taken) == _SETTLED_A_TICK:
-            self.work_queue.alarm.set()  # the rest comes after a look at the gangs that run
+            self.work_queue.alarm.set()  # the rest comes after the gangs that run
         self.work_queue.look_again(self._isolation.jobs("settle", due, self._settle))
         if self._kept_version != self.work_queue.version:
             self._kept_version = self.work_queue.version
             self._loaded.keep(self.work_queue.active())
         self.engines.look()
-        self._look_at_gangs()
+        self._observe_gangs()
         why = self.bus.presence.cut_off
         if (why is not None) != self._is_cut_off:
             self._is_cut_off = why is not None
@@ -193,7 +193,7 @@ class Controller:
         self._isolation.part("scheduling", self.admission.schedule)
         self._isolation.part("clearing away", self._clear_away)
 
-    def _look_at_gangs(self) -> None:
+    def _observe_gangs(self) -> None:
         active = self.work_queue.take_active(machine.monotonic())
         try:
             due = [job_id for job_id in active if not self._isolation.backoff.waits(("advance", job_id))]

@@ -135,7 +135,7 @@ class Deliveries:
             wake.clear()  # before the query: what is committed after it wakes the thread
             try:
                 pause = _IDLE if self._controller.trouble is not None else self._deliver_next(webhook)
-            except DatabaseError:  # said by the controller
+            except DatabaseError:  # reported by the controller
                 pause = _IDLE
             except Exception as error:
                 self._backoff.failed(("bug", webhook.name), f"webhook {webhook.name}: {type(error).__name__}", error)

@@ -13,7 +13,7 @@ from orchestrator import machine
 from orchestrator.domain.units import BYTES, amount
 
 _INTERVAL = 0.5
-"""Seconds between two looks at a volume."""
+"""Seconds between two examinations of a volume."""
 _PATIENCE = 5.0
 """Seconds after which a volume counts as not answering."""
 
@@ -51,14 +51,14 @@ DEFAULT = MinFree(size=1 << 30, share=0.05)
 
 @dataclass
 class _Volume:
-    """One volume, and the result of the last look at it."""
+    """One volume, and the result of its last examination."""
 
     name: str
     path: Path
     short: str | None = None
     absent: str | None = None
     began: machine.Moment | None = None
-    """Start of the look under way."""
+    """Start of the examination under way."""
 
 
 class Disk:
@@ -70,7 +70,7 @@ class Disk:
         minimum: MinFree = DEFAULT,
         checks: Mapping[str, Callable[[], str | None]] | None = None,
     ) -> None:
-        """Look once at each volume. ``volumes``: a directory on each, by the purpose of the volume, such as ``store``.
+        """Examine each volume once. ``volumes``: a directory on each, by the purpose of the volume, such as ``store``.
 
         ``checks``: by purpose, what says that another volume is in its place; may hang.
         """
@@ -78,7 +78,7 @@ class Disk:
         self._checks = checks or {}
         self._ended = threading.Event()
         for volume in self._volumes:
-            volume.short = self._look(volume)
+            volume.short = self._examine(volume)
 
     @property
     def names(self) -> list[str]:
@@ -86,12 +86,12 @@ class Disk:
         return [volume.name for volume in self._volumes]
 
     def start(self) -> None:
-        """Look at each volume about once a second, in a thread of its own: one that hangs keeps no other waiting."""
+        """Examine each volume about once a second, in a thread of its own: one that hangs keeps no other waiting."""
         for volume in self._volumes:
             machine.thread(f"volume {volume.name}", partial(self._watch, volume))
 
     def close(self) -> None:
-        """Stop looking; a look that hangs is abandoned."""
+        """Stop; an examination that hangs is abandoned."""
         self._ended.set()
 
     def shortage(self, purpose: str | None = None) -> str | None:
@@ -123,10 +123,10 @@ class Disk:
     def _watch(self, volume: _Volume) -> None:
         while not self._ended.wait(_INTERVAL):
             volume.began = machine.moment()
-            volume.short = self._look(volume)
+            volume.short = self._examine(volume)
             volume.began = None
 
-    def _look(self, volume: _Volume) -> str | None:
+    def _examine(self, volume: _Volume) -> str | None:
         """How much too little space is free; notes whether another volume is in its place."""
         check = self._checks.get(volume.name)
         volume.absent = check() if check else None

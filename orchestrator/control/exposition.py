@@ -84,7 +84,7 @@ class _Moment(CollectorRegistry):
             held["cpus"][labels] += resources.cpus
             try:
                 main = job.gang.main
-            except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+            except Exception:  # a damaged row, which is reported when the job is settled
                 continue
             progress = self._controller.bus.progress(job.id, attempt.number, main) or {}
             found = {name: value for name in series if isinstance(value := progress.get(name), int | float)}

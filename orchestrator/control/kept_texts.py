@@ -37,7 +37,7 @@ DAYS = 7
 A_DAY = 32 << 20
 """Bytes of texts that one key may upload in 24 hours."""
 _SWEEP_INTERVAL, _FIRST_SWEEP = 3600.0, 60.0
-"""Seconds between two looks for texts that nothing needs, and until the first one."""
+"""Seconds between two searches for texts that nothing needs, and until the first one."""
 _MS_A_DAY = 24 * 3600 * 1000
 
 

@@ -72,7 +72,7 @@ class Monitoring:
         """A message was ``delivered``, has ``failed`` and is tried again, or was ``given up``."""
         self._webhooks.labels(webhook, result).inc()
 
-    def begun(self, job: Job, attempt: Attempt, waited: float) -> Callable[[], None]:
+    def started(self, job: Job, attempt: Attempt, waited: float) -> Callable[[], None]:
         """To be called once it is committed that an attempt begins, ``waited`` seconds after its job could."""
         if attempt.number > 1:
             return self._restarts.labels(job.queue, engine_named(attempt)).inc

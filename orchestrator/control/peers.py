@@ -66,7 +66,7 @@ class Peers:
 
     def start(self) -> None:
         """Leave the first heartbeat; log a warning for each other controller that is present, now and later."""
-        self._look()
+        self._poll()
         self._thread = machine.thread("peers", self._loop)
 
     def close(self) -> None:
@@ -100,9 +100,9 @@ class Peers:
 
     def _loop(self) -> None:
         while not self._ending.wait(BEAT):
-            self._look()
+            self._poll()
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Leave a heartbeat and read the others'; where the store is unavailable, the next heartbeat makes up for it."""
         self._beat += 1
         own = Peer(str(self._home), socket.gethostname(), os.getpid(), self._beat, machine.wall())

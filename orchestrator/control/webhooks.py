@@ -163,7 +163,9 @@ def _webhooks(found: Any, where: str) -> Sequence[Webhook]:
         raise WebhooksError(f'{where}: expected a JSON object, {{"NAME": {{"url": "https://…", "secret": "whsec_…"}}}}')
     for name in found:
         if not NAME.fullmatch(name) or "name" in (found[name] if isinstance(found[name], dict) else {}):
-            raise WebhooksError(f"{where}: {name[:60]!r} is no name of a webhook: letters, digits, '.', '_' and '-'")
+            raise WebhooksError(
+                f"{where}: {name[:60]!r} is not a name for a webhook: expected letters, digits, '.', '_' and '-'"
+            )
     try:
         read = TypeAdapter(dict[str, Webhook]).validate_python(found)
     except ValidationError as error:

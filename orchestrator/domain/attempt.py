@@ -42,7 +42,7 @@ from shared_store.contract.error_text import counted
 UNHEARD = 10.0
 """Seconds of a node's silence from which its job says so."""
 CAUSE_PATIENCE = 90_000
-"""For so long [ms] a gang that has lost nodes which were told to end waits for the end of the node that is the cause."""
+"""For so long [ms] a gang that has lost nodes that were stopped waits for the end of the node that is the cause."""
 FINISHING = 10_000
 """Children of a native job get so long [ms] to end by themselves after the main node is done. On AWS the main node's end cuts them off; a
 rank that prints its last line or closes a file deserves better."""
@@ -125,7 +125,7 @@ class AttemptState:
     stop_reason: str | None = None
     """Set once the job was asked to end."""
     cause_since: int | None = None
-    """Since when only nodes have ended that were told to."""
+    """Since when only nodes have ended that were stopped."""
     done_since: int | None = None
     """Since when the main node is done and children still run."""
     closed: bool = False
@@ -239,7 +239,7 @@ def _judge(state: AttemptState, seen: Observed) -> do.Instructions:
 def _end(state: AttemptState, seen: Observed, *, is_explained: bool) -> do.Instructions:
     """Once the end is decided: the gang is stopped, unless its children may end by themselves.
 
-    ``is_explained``: an earlier look has said why the job ends; the stop may have something to add, which stays.
+    ``is_explained``: an earlier observation has explained why the job ends; the stop may have something to add, which stays.
     """
     if (verdict := state.verdict) is None:
         return ()

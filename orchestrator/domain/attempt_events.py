@@ -23,7 +23,7 @@ class Silence:
 
 @dataclass(frozen=True)
 class Due:
-    """It is time for a look at the attempt."""
+    """It is time to go on with the attempt."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Preempted:
 
 @dataclass(frozen=True)
 class Observed:
-    """A look at the gang."""
+    """The gang was observed."""
 
     moment: int
     """Steady time [ms]."""

@@ -44,7 +44,7 @@ class Keep:
 
 @dataclass(frozen=True)
 class Observe:
-    """Look at the gang: → Observed or Delayed, or nothing before the engine's first look."""
+    """Observe the gang: → Observed or Delayed, or nothing before the engine's first poll."""
 
 
 @dataclass(frozen=True)

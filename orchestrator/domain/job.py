@@ -111,7 +111,7 @@ class NodeEnd:
     lost: bool = False
     """The end was not observed: the node vanished, presumably with its host."""
     asked: bool | None = False
-    """The node was told to end: the cause lies elsewhere. None: that is not known."""
+    """The node was asked to end: the cause lies elsewhere. None: that is not known."""
     cannot_start: bool = False
     """Its program or its container could not be started."""
     fault: str | None = None
@@ -131,7 +131,7 @@ class Verdict:
     reason: str
     exit_code: int | None = None
     certain: bool = True
-    """False while every node that has ended was told to end: the cause may be observed later."""
+    """False while every node that has ended was asked to end: the cause may be observed later."""
     fault: str | None = None
     """As :attr:`NodeEnd.fault`, of the node that was the cause; native jobs only."""
     start_error: str | None = None

@@ -113,7 +113,7 @@ class RunFacts:
 
     name: str
     epoch: int = 0
-    """The highest that a controller has claimed: another one tells that an attempt has begun since."""
+    """The highest that a controller has claimed: another one means that an attempt has started since."""
     results: tuple[str, ...] = ()
     """Files and directories that are neither Muster's records of the run nor its logs and outcomes."""
     logged: frozenset[str] = frozenset()

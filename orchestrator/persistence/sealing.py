@@ -77,4 +77,4 @@ class Seal:
         except OSError as error:
             raise SealError(f"{self.path}: can't be read ({error.strerror}); make it readable for this user") from None
         except ValueError:
-            raise SealError(f"{self.path}: is no sealing key; put it back from a backup; {_LOST}") from None
+            raise SealError(f"{self.path}: is not a sealing key; put it back from a backup; {_LOST}") from None

@@ -319,7 +319,7 @@ class Database:
 
 def _make_private(path: Path) -> None:
     """Create an SQLite file for its user alone, or close one to others: the environments of jobs hold secrets."""
-    with suppress(OSError):  # said by SQLite, in its own words
+    with suppress(OSError):  # SQLite reports it in its own words
         os.close(_private(str(path), os.O_RDWR | os.O_CREAT))
     for name in (path.name, f"{path.name}-wal", f"{path.name}-shm"):  # SQLite gives new ones the mode of the first
         with suppress(OSError):

@@ -278,7 +278,9 @@ def _section_model(section: plugins.JobSection) -> type[OfCheckpoint]:
     """The model of a plug-in's section. Raises PluginError: it can't be imported, or its key is there already."""
     model: type[OfCheckpoint] = plugins.load(section.model, type)
     if not issubclass(model, OfCheckpoint):
-        raise plugins.failed(section.model, TypeError("it is no orchestrator.spec.sections.OfCheckpoint"))
+        raise plugins.failed(
+            section.model, TypeError("it is not a subclass of orchestrator.spec.sections.OfCheckpoint")
+        )
     if section.key in _Spec.model_fields:
         raise plugins.failed(
             section.model, ValueError(f"{section.key} is a key of every job; choose another for the section")
