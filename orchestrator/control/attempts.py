@@ -271,7 +271,7 @@ class Attempts:
             gang = self.gang(job, attempt, job.gang, self._rows.options(attempt.environment, job.queue))
             return self.engine.plan(self.engine.with_secrets(gang))
 
-        self.bus.presence.expect(job.id, attempt.number, len(attempt.nodes))
+        self.bus.expect(job.id, attempt.number, len(attempt.nodes))
         try:
             return Launched(self.engine.launch(_name(attempt), [node.host for node in attempt.nodes], plan, again))
         except NotYet as wait:

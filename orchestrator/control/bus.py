@@ -19,7 +19,7 @@ import os
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -219,6 +219,10 @@ class Bus:
                 with contextlib.suppress(zenoh.ZError):  # a node does not answer, and Zenoh gave up waiting for it
                     session.close()
         self._loopback = self._session = None
+
+    def expect(self, job: str, attempt: int, nodes: int, met: Iterable[int] = ()) -> None:
+        """Listen to the attempt's nodes from now on, until :meth:`forget`; ``met``: those that an earlier controller met."""
+        self.presence.expect(job, attempt, nodes, met)
 
     def token(self, job: str, attempt: int) -> str | None:
         """``MUSTER_BUS_TOKEN`` of the attempt's nodes; None with the bus off."""

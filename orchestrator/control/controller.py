@@ -33,7 +33,7 @@ from orchestrator.control.upkeep import INTERVAL, Upkeep
 from orchestrator.control.work_queue import WorkQueue
 from orchestrator.control.writes import Writes
 from orchestrator.engines.registry import EngineSet
-from orchestrator.persistence.batch_models import Job
+from orchestrator.persistence.batch_models import Attempt, Job
 from orchestrator.persistence.session import Database
 from shared_store.volume.layout import Store
 
@@ -227,12 +227,14 @@ class Controller:
             self.bus.forget(*closed)
         for key in found.keys() - expected:
             nodes = found[key].nodes
-            self.bus.presence.expect(*key, len(nodes), [node.index for node in nodes if node.met])
+            self.bus.expect(*key, len(nodes), [node.index for node in nodes if node.met])
 
-    def _advance(self, session: Session, job: Job) -> Steps:
-        if (attempt := job.open_attempt) is not None:
-            yield from self.attempts.advance(session, job, attempt)
-            self.work_queue.later(job.id, machine.monotonic() + self.attempts.pause(job, attempt))
+    def _advance(self, session: Session, job: Job) -> Steps | None:
+        return None if (attempt := job.open_attempt) is None else self._observe(session, job, attempt)
+
+    def _observe(self, session: Session, job: Job, attempt: Attempt) -> Steps:
+        yield from self.attempts.advance(session, job, attempt)
+        self.work_queue.later(job.id, machine.monotonic() + self.attempts.pause(job, attempt))
 
     def _committed(self, jobs: Sequence[Job]) -> None:
         """Note the jobs of a commit as they are, where this thread has made it; read them again after a commit of a request."""

@@ -28,8 +28,7 @@ def settle(session: Session, job: Job, clock: Clock) -> None:
     elif job.stop_reason is not None:
         job.move(Status.FAILED, job.stop_reason)
     elif job.status in (Status.SUBMITTED, Status.PENDING):
-        found = {each.on_id: session.get(Job, each.on_id) for each in job.dependencies}
-        states = {on: Status.FAILED if other is None else other.status for on, other in found.items()}
+        states = {each.on_id: _state(session, each.on_id) for each in job.dependencies}
         failed = [on for on, status in states.items() if status == Status.FAILED]
         pending = [on for on, status in states.items() if status != Status.SUCCEEDED]
         if failed:
@@ -67,3 +66,8 @@ def _failed_children(session: Session, array: Job, failed: int) -> str:
     words = [f"{each.array_index} ({excerpt(' '.join(each.reason.words.split()), _LONGEST)})" for each in first]
     others = [f"{failed - len(words)} more"] if failed > len(words) else []
     return f"{failed} of {array.array_size} array jobs failed: {', '.join([*words, *others])}"
+
+
+def _state(session: Session, job_id: str) -> str:
+    job = session.get(Job, job_id)
+    return job.status if job is not None else Status.FAILED

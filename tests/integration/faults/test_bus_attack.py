@@ -55,8 +55,8 @@ class Victim:
 def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
     bus = Bus(tmp_path_factory.mktemp("home"), {})
     bus.open()
-    bus.presence.expect("victim", 1, nodes=2)
-    bus.presence.expect("mallory", 1, nodes=2)
+    bus.expect("victim", 1, nodes=2)
+    bus.expect("mallory", 1, nodes=2)
     yield bus
     bus.close()
 
@@ -255,8 +255,8 @@ def test_messages_of_a_closed_attempt_are_dropped(tmp_path: Path) -> None:
     bus = Bus(tmp_path, {})
     bus.open()
     try:
-        bus.presence.expect("victim", 1, nodes=2)
-        bus.presence.expect("mallory", 1, nodes=2)
+        bus.expect("victim", 1, nodes=2)
+        bus.expect("mallory", 1, nodes=2)
         victim, session = Victim(bus), attacker(bus)
         victim.report(bus, {"iteration": 7})
         bus.forget("victim", 1)

@@ -43,7 +43,7 @@ bus.tend(None)
 def bus(tmp_path: Path) -> Iterator[Bus]:
     bus = Bus(tmp_path, {})
     bus.open()
-    bus.presence.expect("j", 1, nodes=2)
+    bus.expect("j", 1, nodes=2)
     yield bus
     bus.close()
 
