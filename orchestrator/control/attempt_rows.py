@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import TypeVar
+from typing import Any
 
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
@@ -21,8 +21,6 @@ from orchestrator.persistence.batch_models import (
     RunRecord,
     SchedulingPolicy,
 )
-
-_Row = TypeVar("_Row")
 
 GRACE = 30.0
 """Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
@@ -80,23 +78,23 @@ class SharedRows:
     def __init__(self, session: Session, jobs: Sequence[Job]) -> None:
         self._session, self._jobs = session, jobs
 
-    def _read(self, query: Select[_Row]) -> Iterable[_Row]:
+    def _by_name(self, rows: Select[Any]) -> dict[str, Any]:
         """Rows as they are now: the session may have some of before, which requests have changed since."""
-        return self._session.scalars(query, execution_options={"populate_existing": True})
+        found: Iterable[Any] = self._session.scalars(rows, execution_options={"populate_existing": True})
+        return {each.name: each for each in found}
 
     @cached_property
     def queues(self) -> dict[str, JobQueue]:
         """By name."""
-        query = select(JobQueue).where(JobQueue.name.in_({job.queue for job in self._jobs}))
-        return {each.name: each for each in self._read(query)}
+        return self._by_name(select(JobQueue).where(JobQueue.name.in_({job.queue for job in self._jobs})))
 
     @cached_property
     def _environments(self) -> dict[str, ComputeEnvironment]:
-        return {each.name: each for each in self._read(select(ComputeEnvironment))}
+        return self._by_name(select(ComputeEnvironment))
 
     @cached_property
     def _policies(self) -> dict[str, SchedulingPolicy]:
-        return {each.name: each for each in self._read(select(SchedulingPolicy))}
+        return self._by_name(select(SchedulingPolicy))
 
     def policy(self, queue: str) -> SchedulingPolicy | None:
         """The scheduling policy of a queue; None where it has none."""

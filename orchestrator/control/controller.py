@@ -70,18 +70,13 @@ class Controller:
     ) -> None:
         """
         Args:
-            database: Of the jobs.
-            engines: What starts their gangs.
-            store: Of their runs.
-            bus: To the nodes.
+            database: Of the jobs; ``engines`` start their gangs, ``store`` has their runs, ``bus`` reaches their nodes.
             peers: The other controllers of the store.
             interval: Seconds between two passes where nothing calls for one.
             retention: Seconds for which ended jobs are kept, as :class:`.retention.Retention` says.
-            clock: Steady time.
             min_free: Free space that the volumes of the store and the database need for something new to start.
             identity: Of the store; without it whatever is at its path is the store.
-            runs: The store as the loop uses it.
-            disk: The volumes.
+            clock, runs, disk: Steady time, the store as the loop uses it, and the volumes; made here where they are None.
 
         Raises:
             DatabaseError: The database can't be read.

@@ -14,7 +14,7 @@ from orchestrator.control.node_ends import node_end
 from orchestrator.control.run_store import Errands, Key, RunContent, RunStore
 from orchestrator.domain.attempt_events import Observed, Silence
 from orchestrator.domain.job import NodeEnd, aws_ending
-from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
+from orchestrator.engines.api import GangStatus, NodePhase
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.batch_models import Attempt, Job, Node, now
 from shared_store.volume.node_outcomes import Outcome
@@ -81,13 +81,14 @@ class Observer:
         age = self._engine.status_age(handle)
         age = None if age is None or seen.checked is None else max(age, machine.monotonic() - seen.checked)
 
-        def silence(index: int, node: NodeStatus) -> Silence | None:
-            if not node.running or self._bus.endpoint is None:
-                return None
-            runs = node.phase is not NodePhase.UNREACHABLE and not node.stale
-            return self._bus.presence.silence((*key, index), age, runs)
-
-        return [silence(*each) for each in enumerate(status)]
+        if self._bus.endpoint is None:
+            return [None] * len(status)
+        return [
+            self._bus.presence.silence((*key, index), age, node.phase is not NodePhase.UNREACHABLE and not node.stale)
+            if node.running
+            else None
+            for index, node in enumerate(status)
+        ]
 
     def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus, silences: Sequence[Silence | None]) -> bool:
         """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.

@@ -51,8 +51,7 @@ def take_snapshot(
     """Read everything that the pass depends on.
 
     Args:
-        session: The session.
-        clock: Steady time.
+        session, clock: The database, and steady time.
         capacities: All that the engines have, by their names.
         waiting: The jobs that wait for room.
         holding: The jobs whose gang holds some, with that attempt.

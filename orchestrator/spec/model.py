@@ -216,7 +216,7 @@ class _Spec(Section):
         return document
 
     @model_validator(mode="after")
-    def _one_kind(self) -> _Spec:
+    def _is_consistent(self) -> _Spec:
         names = [kind for kind in KINDS if getattr(self, kind) is not None]
         if not names:
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found none")
@@ -224,21 +224,11 @@ class _Spec(Section):
             raise ValueError(f"evaluation is for jobs that train, not for {names[0]}")
         if names[0] in plugins.sections() and (self.nodes.max > 1 or self.resources.gpus > 1):
             raise ValueError(f"{names[0]}: it runs on one node with at most one GPU")
-        return self
-
-    @model_validator(mode="after")
-    def _given_once(self) -> _Spec:
         if both := sorted(self.secrets.keys() & self.environment.keys()):
             raise ValueError(f"secrets: {both[0]} is in environment, too; give it once")
-        return self
-
-    @model_validator(mode="after")
-    def _trackable(self) -> _Spec:
-        if self.track is None:
-            return self
-        if self.train is None:
+        if self.track is not None and self.train is None:
             raise ValueError(f"track: only a training has metrics to track; this job has {self.kind}")
-        if key := key_in(self.environment):
+        if self.track is not None and (key := key_in(self.environment)):
             raise ValueError(
                 f"environment.{key}: the key would be stored in the run; remove it, and give it as a secret: "
                 f"secrets: {{{key}: NAME}}"

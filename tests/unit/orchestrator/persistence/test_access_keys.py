@@ -16,13 +16,6 @@ from tests.support.waiting import wait_for
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database.at(tmp_path)
-    yield database
-    database.close()
-
-
-@pytest.fixture
 def keys(database: Database, tmp_path: Path) -> KeyStore:
     return KeyStore(OwnSecrets(database, tmp_path))
 

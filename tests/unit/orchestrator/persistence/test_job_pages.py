@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -22,13 +21,6 @@ from orchestrator.persistence.retention_rows import forget_jobs
 from orchestrator.persistence.session import Database
 
 QUEUES = [f"queue-{number}" for number in range(60)]
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database.at(tmp_path)
-    yield database
-    database.close()
 
 
 def job(name: str, created_at: int, queue: str = "default", status: str = "RUNNABLE", **more: Any) -> Job:
