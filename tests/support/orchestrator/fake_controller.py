@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -64,6 +65,15 @@ class FakeController(Generic[E]):
     def wait(self, name: str, *wanted: Status) -> Job:
         found: Job = wait_for(lambda: (j := self.job(name)).status in wanted and j, 30, f"{name} is {wanted}")
         return found
+
+    def ticks(self, condition: Callable[[], bool]) -> None:
+        """Make passes until the condition holds."""
+
+        def holds() -> bool:
+            self.controller.tick()
+            return condition()
+
+        wait_for(holds, 30, "the state")
 
     def explains(self, name: str, said: str) -> None:
         """Wait until a job's reason, as every answer shows it, has these words."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -30,13 +29,6 @@ TEXT = "def reward_function(params):\n    return 1.0\n"
 DIGEST = digest_of(TEXT)
 LONG = {"file": "long.py", "text": TEXT + "#" * (30 << 10)}
 _TRAIN = {"task": "elsewhere.mine:Task", "worlds": 4, "iterations": 1, "config": {"reward_function": LONG}}
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database(f"sqlite:///{tmp_path}/muster.db")
-    yield database
-    database.close()
 
 
 @pytest.fixture

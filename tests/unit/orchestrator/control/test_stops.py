@@ -76,17 +76,12 @@ def test_why_a_gang_can_not_be_stopped_stays_its_reason_at_every_further_try(
     monkeypatch.setattr(FakeEngine, "stop", deny)
     with ExitStack() as stack:
         bench = FakeController(tmp_path, FakeEngine(capacity=Hosts([Host("fake/host", 8.0, (), 8192)])), stack)
-
-        def ticked(done: bool) -> bool:
-            bench.controller.tick()
-            return done
-
         bench.submit("a")
-        wait_for(lambda: ticked(bench.job("a").status == Status.RUNNING), 30, "that it runs")
+        bench.ticks(lambda: bench.job("a").status == Status.RUNNING)
         with bench.database.session() as session:
             ask_to_end(session, Job.id == "a", "enough")
         monkeypatch.setattr(Session, "commit", noted)
-        wait_for(lambda: ticked(len(tries) > 3), 30, "further tries")
+        bench.ticks(lambda: len(tries) > 3)
     denied = "attempt 1 can't be stopped: not authorized; trying again"
     assert "enough; its nodes are ending" in reasons
     first = reasons.index(denied)
