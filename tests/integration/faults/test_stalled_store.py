@@ -170,20 +170,24 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
         try:
             if there == "another store":
                 add_run(Store(path).open(), "foreign")
-            said = f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+            message = (
+                f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+            )
             assert asked(server, "/api/runs/taught").status_code == 503, (
                 "what is missing is not taken for deleted meanwhile"
             )
             # the look before may have found the path empty
-            wait_for(lambda: said in (server.controller.access.disk.unavailable("store") or ""), 60, "that it is seen")
+            wait_for(
+                lambda: message in (server.controller.access.disk.unavailable("store") or ""), 60, "that it is seen"
+            )
             answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/models", "/runs/taught")]
             for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
                 body = {"name": "copied"}
                 answers.append(httpx.post(f"{server.url}/api/{asks}", json=body, timeout=60))
             for answer in answers:
-                assert answer.status_code == 503 and said in html.unescape(answer.text), answer.text
+                assert answer.status_code == 503 and message in html.unescape(answer.text), answer.text
             assert [each["id"] for each in asked(server, "/api/jobs").json()["jobs"]] == [job]
-            assert said in asked(server, f"/api/jobs/{job}").json()["storeProblem"]
+            assert message in asked(server, f"/api/jobs/{job}").json()["storeProblem"]
             client.batch("TerminateJob", jobId=job, reason="enough")
         finally:
             path.rename(tmp_path / "wrong") if path.exists() else None

@@ -28,8 +28,10 @@ E = TypeVar("E", bound=FakeEngine)
 def properties(cpus: int, nodes: int = 1, **variables: str) -> dict[str, Any]:
     """Of a native job; ``cpus`` of each node."""
     needs = [{"type": "VCPU", "value": str(cpus)}]
-    given = [{"name": name, "value": value} for name, value in {"MUSTER_ON_CHILD_FAILURE": "fail", **variables}.items()]
-    container = {"command": ["true"], "resourceRequirements": needs, "environment": given}
+    values = [
+        {"name": name, "value": value} for name, value in {"MUSTER_ON_CHILD_FAILURE": "fail", **variables}.items()
+    ]
+    container = {"command": ["true"], "resourceRequirements": needs, "environment": values}
     return {"numNodes": nodes, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
 
 

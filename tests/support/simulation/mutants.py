@@ -26,7 +26,7 @@ Mutant = AbstractContextManager[Any]
 def silence_alone_counts() -> Mutant:
     """B1: a node counts as dead when it is silent for 20 s, whatever its engine says, and however many others are."""
 
-    def silence(self: Presence, node: Node, asked: float | None, runs: bool = True) -> Silence | None:
+    def silence(self: Presence, node: Node, requested: float | None, runs: bool = True) -> Silence | None:
         heard = self._nodes.get(node)
         if heard is None or heard.gone is None:
             return None

@@ -130,12 +130,12 @@ def test_a_gang_that_ends_costs_looks_at_no_other(
 
 def test_an_engine_is_asked_for_all_gangs_at_once(bench: tuple[FakeController[FakeEngine], Costs]) -> None:
     controller, _ = bench
-    asked, observe = list[int](), controller.engine.observe
+    requested, observe = list[int](), controller.engine.observe
 
     def observed(handles: Any) -> Any:
-        asked.append(len(handles))
+        requested.append(len(handles))
         return observe(handles)
 
     controller.engine.observe = observed  # type: ignore[method-assign]
-    controller.ticks(lambda: len(asked) >= 3)
-    assert set(asked) == {GANGS}
+    controller.ticks(lambda: len(requested) >= 3)
+    assert set(requested) == {GANGS}

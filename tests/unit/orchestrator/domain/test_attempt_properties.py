@@ -188,8 +188,8 @@ def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_rea
         if state.closed:
             continue
         next_look = do.Observe if state.launched else do.Launch if state.prepared else do.Prepare
-        wanted = next_look if state.prepared or (state.verdict is None and state.stop_reason is None) else do.WindUp
-        assert isinstance(attempt.step(state, Due())[-1], wanted)
+        expected = next_look if state.prepared or (state.verdict is None and state.stop_reason is None) else do.WindUp
+        assert isinstance(attempt.step(state, Due())[-1], expected)
         follows = attempt.step(state, seen) if state.launched else ()
         if state.verdict is not None or any(isinstance(each, do.Decide) for each in follows):
             assert not follows or isinstance(follows[-1], do.Stop | do.Await)

@@ -82,6 +82,6 @@ def test_an_amount_fits_where_there_is_enough_of_every_kind(asked: Resources, fr
 
 
 @given(amounts, amounts)
-def test_allocating_and_releasing_restores_the_free_resources(there: Resources, taken: Resources) -> None:
-    assert there - taken + taken == there and taken <= there + taken
-    assert (taken <= there) == (Resources() <= there - taken)
+def test_allocating_and_releasing_restores_the_free_resources(present: Resources, taken: Resources) -> None:
+    assert present - taken + taken == present and taken <= present + taken
+    assert (taken <= present) == (Resources() <= present - taken)

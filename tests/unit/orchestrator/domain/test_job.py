@@ -36,10 +36,10 @@ LEGAL = {
 
 def ends(*codes: tuple[float, ...] | int | None) -> list[NodeEnd | None]:
     """By node index: a code, its time and whether it was asked to end, or None for a node that runs."""
-    told = [each if isinstance(each, tuple) else (each,) for each in codes]
+    reported = [each if isinstance(each, tuple) else (each,) for each in codes]
     return [
         None if each[0] is None else NodeEnd(int(each[0]), f"exit {each[0]}", *each[1:2] or (1.0,), asked=len(each) > 2)
-        for each in told
+        for each in reported
     ]
 
 
@@ -211,12 +211,12 @@ def test_the_reason_of_a_container_is_the_one_that_aws_gives(
 
 @pytest.mark.parametrize("policy", ["restart", "ignore", "fail"])
 def test_the_fault_of_the_node_that_was_the_cause_is_the_attempts(policy: str) -> None:
-    here, there = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"
-    main, child = NodeEnd(1, "exit 1", 1.0, fault=here), NodeEnd(1, "exit 1", 2.0, fault=there)
+    here, present = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"
+    main, child = NodeEnd(1, "exit 1", 1.0, fault=here), NodeEnd(1, "exit 1", 2.0, fault=present)
     verdict = judge(policy, 0, (main, child))
     assert verdict is not None and verdict.fault == here
     late = judge(policy, 0, (replace(main, ended=3.0), child))
-    assert late is not None and late.fault == (here if policy == "ignore" else there)
+    assert late is not None and late.fault == (here if policy == "ignore" else present)
     aws = judge_as_aws(0, (main, child), "host")
     assert aws is not None and aws.fault is None
 

@@ -66,8 +66,8 @@ def test_pages_in_both_directions_are_the_whole_list_once(
     database: Database, queues: Sequence[str] | None, statuses: Sequence[str], most: int
 ) -> None:
     listed = fill(database, 300)
-    wanted = [each.id for each in listed if queues is None or each.queue in queues]
-    wanted = [each.id for each in listed if each.id in set(wanted) and (not statuses or each.status in statuses)]
+    expected = [each.id for each in listed if queues is None or each.queue in queues]
+    expected = [each.id for each in listed if each.id in set(expected) and (not statuses or each.status in statuses)]
     with database.session() as session:
         forth, page = [], read_page(session, most, queues, statuses)
         assert page.is_first
@@ -76,7 +76,7 @@ def test_pages_in_both_directions_are_the_whole_list_once(
             page = read_page(session, most, queues, statuses, after=place_of(page.jobs[-1]))
             assert not page.is_first
             forth.append(page)
-        assert [each for page in forth for each in ids(page.jobs)] == wanted
+        assert [each for page in forth for each in ids(page.jobs)] == expected
         assert all(len(page.jobs) == most for page in forth[:-1])
         back = []
         while not page.is_first and page.jobs:

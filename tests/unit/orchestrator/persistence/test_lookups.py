@@ -90,7 +90,7 @@ def test_a_lookup_costs_the_same_with_many_jobs(database: Database, look: str) -
 def test_the_beginning_of_an_array_s_id_is_not_that_of_its_children(database: Database) -> None:
     fill(database, 20)
     statements: list[str] = []
-    event.listen(database.engine, "before_cursor_execute", lambda *told: statements.append(told[2]))
+    event.listen(database.engine, "before_cursor_execute", lambda *reported: statements.append(reported[2]))
     with database.session() as session:
         found = find_job(session, "aaaaaaaa")
         assert found is not None and found.id == ARRAY
