@@ -12,8 +12,7 @@ from orchestrator import machine
 from orchestrator.control.attempts import Attempts, Steps
 from orchestrator.control.clock import Clock
 from orchestrator.control.disk import Disk
-from orchestrator.control.isolation import Isolation
-from orchestrator.control.loaded import LoadedJobs
+from orchestrator.control.isolation import Isolation, LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.snapshot import holding_of, take_snapshot
 from orchestrator.control.work_queue import WorkQueue

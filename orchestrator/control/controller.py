@@ -18,9 +18,8 @@ from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.dependencies import settle
 from orchestrator.control.disk import DEFAULT, Disk, MinFree
-from orchestrator.control.isolation import Isolation
+from orchestrator.control.isolation import Isolation, LoadedJobs
 from orchestrator.control.kept_texts import KeptTexts
-from orchestrator.control.loaded import LoadedJobs
 from orchestrator.control.log_hub import LogHub
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.peers import Peers

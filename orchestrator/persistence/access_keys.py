@@ -23,8 +23,7 @@ from orchestrator import machine
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError
 from orchestrator.domain.identifiers import ACCESS_KEY_ID, SHARE
 from orchestrator.persistence.own_models import AccessKey
-from orchestrator.persistence.own_secrets import OwnSecrets
-from orchestrator.persistence.sealing import SealError
+from orchestrator.persistence.own_secrets import OwnSecrets, SealError
 from shared_store.volume.layout import NAME
 
 INTERVAL = 1.0

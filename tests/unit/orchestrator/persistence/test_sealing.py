@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.persistence.own_secrets import OwnSecrets
-from orchestrator.persistence.sealing import Seal, SealError
+from orchestrator.persistence.own_secrets import OwnSecrets, Seal, SealError
 from orchestrator.persistence.session import Database
 
 TEXT = "a-secret-of-the-bus"
