@@ -259,7 +259,7 @@ def followed(url: str, paths: list[str]) -> Iterator[list[int]]:
 
 
 def watched(server: Serving) -> dict[str, float]:
-    """CPU (share of a core), memory [B] and the reconciler's passes while a job changes each second."""
+    """CPU (share of a core), memory [B] and the loop's passes while a job changes each second."""
     pid = str(server.process.pid)
     waiting = [each["id"] for each in server.client.get("/api/jobs", status="RUNNABLE", max=50)["jobs"]]
     before, began, cpu = passes(server), time.monotonic(), load.own_seconds(pid)

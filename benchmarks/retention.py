@@ -79,13 +79,13 @@ def rounds(bench: Bench[LoggingEngine], jobs: int, count: int, takes: bool = Tru
     found: list[Size] = []
     loop: list[float] = []
     monitoring = bench.controller.monitoring
-    took = monitoring.loop_took
+    took = monitoring.loop.observe
 
-    def note(seconds: float) -> None:
+    def note(seconds: float, *_: object) -> None:
         loop.append(seconds)
         took(seconds)
 
-    monitoring.loop_took = note  # type: ignore[method-assign]
+    monitoring.loop.observe = note  # type: ignore[method-assign, assignment]
     each, ending = jobs // count, threading.Event()
 
     def passes() -> None:

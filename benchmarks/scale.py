@@ -129,7 +129,7 @@ class Bench(Generic[E]):
             names = [f"job-{number:06d}" for number in range(start, min(first + count, start + SUBMITTED_AT_ONCE))]
             with self.database.session() as session:
                 session.add_all(self._row(name, document, nodes, attempts) for name in names)
-        self.controller.alarm.ring()
+        self.controller.work_queue.alarm.set()
 
     @staticmethod
     def _row(name: str, document: dict[str, Any], nodes: int, attempts: int) -> Job:
@@ -188,7 +188,7 @@ def controller(
             bus.open()
             stack.callback(bus.close)
         runs = store_type(store, peers)
-        controller = Controller.assemble(database, engines, store, bus, peers, runs=runs, retention=retention)
+        controller = Controller(database, engines, store, bus, peers, runs=runs, retention=retention)
         stack.callback(controller.close)
         controller.start()
         yield Bench(home, controller, database, engine, watch)

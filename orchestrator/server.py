@@ -156,7 +156,7 @@ class Server:
             self.peers = Peers(self.store, home, identity.check)
             stack.callback(self.peers.close)
             try:
-                self.controller = Controller.assemble(
+                self.controller = Controller(
                     found,
                     nodes,
                     self.store,

@@ -187,6 +187,6 @@ def _engine(name: str) -> str:
     capacity = make_engine(name, Setting(muster_home())).capacity()
     if isinstance(capacity, Queued) and isinstance(capacity.limits, Limit):
         return f"queue {capacity.limits.queue}, at most {capacity.limits.resources.cpus:g} CPUs for a gang"
-    hosts = [host for host in capacity.machines if not host.away]
+    hosts = [host for host in capacity.machines if not host.unavailable]
     cpus, gpus = sum(host.cpus for host in hosts), sum(len(host.gpus) for host in hosts)
     return f"{counted(len(hosts), 'host')}, {cpus:g} CPU{'s' if cpus != 1 else ''}, {counted(gpus, 'GPU')}"

@@ -217,7 +217,7 @@ def serve(
     echo(server.access.admitted())
     echo(f"home {muster_home()}, store {server.store.path}")
     manager.tell("READY=1")
-    manager.keep_alive(lambda: server.controller.heartbeat.problem() is None, ended.wait)
+    manager.keep_alive(lambda: server.controller.monitoring.loop_problem() is None, ended.wait)
     try:
         while not ended.wait(1.0):  # Python sees a signal that another thread took when this one wakes
             pass

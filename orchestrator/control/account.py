@@ -49,16 +49,16 @@ def recognise(session: Session, account: str | None, region: str | None, tempora
         )
         known = KnownAccount(id=1, account=first[0], region=first[1])
         session.add(known)
-    wanted = account or (known.account if known else DEFAULT.id), region or (known.region if known else DEFAULT.region)
-    if known is not None and wanted != (known.account, known.region):
-        option = f"--account-id {wanted[0][:40]}" if wanted[0] != known.account else f"--region {wanted[1][:60]}"
+    chosen = account or (known.account if known else DEFAULT.id), region or (known.region if known else DEFAULT.region)
+    if known is not None and chosen != (known.account, known.region):
+        option = f"--account-id {chosen[0][:40]}" if chosen[0] != known.account else f"--region {chosen[1][:60]}"
         raise UsageError(
             f"{option}: this controller has the ARNs of account {known.account} in {known.region} since its first start, and its "
             "clients know them; leave the option out, or begin anew: another MUSTER_HOME, and another --database where one is used"
         )
-    if not re.fullmatch("[0-9]{12}", wanted[0]):
-        raise UsageError(f"--account-id {wanted[0][:40]}: expected 12 digits, such as 123456789012")
-    found = Account(*wanted, _partition(wanted[1]))
+    if not re.fullmatch("[0-9]{12}", chosen[0]):
+        raise UsageError(f"--account-id {chosen[0][:40]}: expected 12 digits, such as 123456789012")
+    found = Account(*chosen, _partition(chosen[1]))
     if found != DEFAULT and known in session.new:  # the definitions of jobs that temporary controllers had
         before, after = (f"arn:{each.partition}:batch:{each.region}:{each.id}:" for each in (DEFAULT, found))
         session.execute(update(Job).values(definition=func.replace(Job.definition, before, after)))

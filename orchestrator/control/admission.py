@@ -12,8 +12,7 @@ from orchestrator import machine
 from orchestrator.control.attempts import Attempts, Steps
 from orchestrator.control.clock import Clock
 from orchestrator.control.disk import Disk
-from orchestrator.control.isolation import Isolation
-from orchestrator.control.loaded import LoadedJobs
+from orchestrator.control.isolation import Isolation, LoadedJobs
 from orchestrator.control.monitoring import Monitoring
 from orchestrator.control.snapshot import holding_of, take_snapshot
 from orchestrator.control.work_queue import WorkQueue
@@ -58,7 +57,7 @@ class Admission:
         """Of the last pass: the version of the work queue, when it began, and the seconds that it took."""
         self._pass_interval = _PASS_INTERVAL
 
-    def look(self) -> None:
+    def schedule(self) -> None:
         """Make a scheduling pass, where something changed or time has passed, and enough space is free."""
         shortage = self._disk.shortage()
         if self._short != (shortage is not None):
@@ -98,7 +97,7 @@ class Admission:
         self._report, self._leading, self._turns = decisions.report, decisions.leading, decisions.turns
         took = machine.monotonic() - started
         self._passed = (version, started, took)
-        self._monitoring.pass_took(took)
+        self._monitoring.passes.observe(took)
         self._carry_out(decisions)
 
     def _carry_out(self, decisions: Decisions) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import TypeVar
+from typing import Any
 
 from sqlalchemy import Select, select
 from sqlalchemy.orm import Session
@@ -22,8 +22,6 @@ from orchestrator.persistence.batch_models import (
     SchedulingPolicy,
 )
 
-_Row = TypeVar("_Row")
-
 GRACE = 30.0
 """Seconds from SIGTERM to SIGKILL, as on AWS Batch."""
 NO_EPOCH = 0
@@ -33,7 +31,7 @@ NO_EPOCH = 0
 def state_of(job: Job, attempt: Attempt) -> AttemptState:
     """The state of an attempt, by its rows: all but what only a controller's memory has."""
     gang = job.gang
-    spent = [each for each in job.attempts if each.spent and each is not attempt]
+    counted = [each for each in job.attempts if each.spent and each is not attempt]
     terms = Terms(
         number=attempt.number,
         hosts=[node.host for node in attempt.nodes],
@@ -43,10 +41,10 @@ def state_of(job: Job, attempt: Attempt) -> AttemptState:
         grace=GRACE,
         timeout=job.timeout,
         allowed=job.attempts_allowed,
-        spent=len(spent),
+        spent=len(counted),
         conditions=job.evaluate_on_exit,
         cancelled=sum(each.ending == Ending.CANCELLED for each in job.attempts if each is not attempt),
-        last_fault=spent[-1].fault if spent else None,
+        last_fault=counted[-1].fault if counted else None,
     )
     verdict = None
     if attempt.ending is not None:
@@ -80,23 +78,23 @@ class SharedRows:
     def __init__(self, session: Session, jobs: Sequence[Job]) -> None:
         self._session, self._jobs = session, jobs
 
-    def _read(self, wanted: Select[_Row]) -> Iterable[_Row]:
+    def _by_name(self, rows: Select[Any]) -> dict[str, Any]:
         """Rows as they are now: the session may have some of before, which requests have changed since."""
-        return self._session.scalars(wanted, execution_options={"populate_existing": True})
+        found: Iterable[Any] = self._session.scalars(rows, execution_options={"populate_existing": True})
+        return {each.name: each for each in found}
 
     @cached_property
     def queues(self) -> dict[str, JobQueue]:
         """By name."""
-        wanted = select(JobQueue).where(JobQueue.name.in_({job.queue for job in self._jobs}))
-        return {each.name: each for each in self._read(wanted)}
+        return self._by_name(select(JobQueue).where(JobQueue.name.in_({job.queue for job in self._jobs})))
 
     @cached_property
     def _environments(self) -> dict[str, ComputeEnvironment]:
-        return {each.name: each for each in self._read(select(ComputeEnvironment))}
+        return self._by_name(select(ComputeEnvironment))
 
     @cached_property
     def _policies(self) -> dict[str, SchedulingPolicy]:
-        return {each.name: each for each in self._read(select(SchedulingPolicy))}
+        return self._by_name(select(SchedulingPolicy))
 
     def policy(self, queue: str) -> SchedulingPolicy | None:
         """The scheduling policy of a queue; None where it has none."""
@@ -110,14 +108,14 @@ class SharedRows:
     @cached_property
     def runs(self) -> dict[str, RunRecord]:
         """The owners of the jobs' runs, by name; a record that is added belongs here, too."""
-        wanted = select(RunRecord).where(RunRecord.name.in_({job.run for job in self._jobs}))
-        return {each.name: each for each in self._session.scalars(wanted)}
+        query = select(RunRecord).where(RunRecord.name.in_({job.run for job in self._jobs}))
+        return {each.name: each for each in self._session.scalars(query)}
 
     @cached_property
     def _epochs(self) -> dict[str, list[int]]:
         found: dict[str, list[int]] = defaultdict(list)
-        wanted = select(Job.run, Attempt.epoch).join(Attempt).where(Job.run.in_({job.run for job in self._jobs}))
-        for run, epoch in self._session.execute(wanted):
+        query = select(Job.run, Attempt.epoch).join(Attempt).where(Job.run.in_({job.run for job in self._jobs}))
+        for run, epoch in self._session.execute(query):
             found[run].append(epoch)
         return found
 

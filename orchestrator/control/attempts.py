@@ -26,36 +26,9 @@ from orchestrator.control.run_store import Errands, Key, ObservedRun, RunContent
 from orchestrator.control.snapshot import DEFAULT_DECAY, new_nodes
 from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
+from orchestrator.domain import attempt_instructions as do
 from orchestrator.domain.attempt import FINISHING, AttemptPhase, AttemptState, after, step
-from orchestrator.domain.attempt_events import (
-    Delayed,
-    Due,
-    Event,
-    Gone,
-    LaunchDelayed,
-    Launched,
-    LaunchRefused,
-    Preempted,
-    Prepared,
-    PrepareDelayed,
-    PrepareRefused,
-)
-from orchestrator.domain.attempt_instructions import (
-    Close,
-    Decide,
-    Explain,
-    Instruction,
-    Keep,
-    Launch,
-    MarkRunning,
-    Observe,
-    Prepare,
-    Save,
-    Stop,
-    TakeEpoch,
-    WindUp,
-    Withdraw,
-)
+from orchestrator.domain.attempt_events import Delayed, Due, Event, Gone, Launched, Preempted, Prepared, Refused
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status
 from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
@@ -73,7 +46,7 @@ _READERS = 16
 _CANCELLATIONS = 3
 """How often a job is started again, by default, after others have cancelled it in its engine's own queue."""
 _LEAST, _LATER = 0.02, 60.0
-"""Seconds until the next look at an attempt: at least, and at one for which nothing is due."""
+"""Seconds until an attempt is advanced again: at least, and where nothing is due."""
 
 
 Steps = Generator[Callable[[], None], None, None]
@@ -119,7 +92,7 @@ class Attempts:
         withdrawn: Callable[[str, str], None],
         texts: KeptTexts,
     ) -> None:
-        """``changed``: called, from any thread, with a job whose attempt should be looked at; ``withdrawn``: with one that can't start
+        """``changed``: called, from any thread, with a job whose attempt should be advanced; ``withdrawn``: with one that can't start
         now, and why. ``texts``: of which each run gets those that its job names.
         """
         self.engine, self.runs, self.bus = engine, runs, bus
@@ -156,11 +129,11 @@ class Attempts:
         yield from self._happened(session, job, attempt, opened, Due())
 
     def advance(self, session: Session, job: Job, attempt: Attempt) -> Steps:
-        """One look at an open attempt."""
+        """Observe an open attempt and go on with it."""
         return self._happened(session, job, attempt, self._opened(job, attempt), Due())
 
     def pause(self, job: Job, attempt: Attempt) -> float:
-        """Seconds until the next look, where no engine, errand, node or request asks for an earlier one."""
+        """Seconds until :meth:`advance`, where no engine, errand, node or request calls for it earlier."""
         if not _is_open(job, attempt):
             return _LATER
         opened = self._opened(job, attempt)
@@ -189,11 +162,11 @@ class Attempts:
         """Carry out the instructions that follow from an event, and from the events that these cause."""
         for instruction in step(opened.state, event):
             match instruction:
-                case Save():
+                case do.Save():
                     yield opened.committed
-                case Withdraw(reason):
+                case do.Withdraw(reason):
                     yield self._withdraw(job, attempt, opened, reason)
-                case Close():
+                case do.Close():
                     yield self._close(session, job, attempt, opened, instruction)
                 case _:
                     then = self._carry_out(session, job, attempt, opened, instruction)
@@ -222,42 +195,46 @@ class Attempts:
         return opened
 
     def _carry_out(
-        self, session: Session, job: Job, attempt: Attempt, opened: _Open, instruction: Instruction
+        self, session: Session, job: Job, attempt: Attempt, opened: _Open, instruction: do.Instruction
     ) -> Event | None:
         match instruction:
-            case Prepare():
+            case do.Prepare():
                 return self._prepare(session, job, attempt, opened)
-            case TakeEpoch(epoch):
+            case do.TakeEpoch(epoch):
                 attempt.epoch = epoch
                 waited = attempt.held_since - (job.queued_since or attempt.held_since) if attempt.held_since else 0
-                opened.uncommitted.append(self.monitoring.begun(job, attempt, waited / 1000))
+                opened.uncommitted.append(self.monitoring.started(job, attempt, waited / 1000))
                 job.first_epoch = job.first_epoch or epoch
-            case Launch(again):
+            case do.Launch(again):
                 return self._launch(job, attempt, again)
-            case Keep(handle):
+            case do.Keep(handle):
                 attempt.handle = handle
-            case Observe():
+            case do.Observe():
                 return self._observer.observe(job, attempt)
-            case Explain(reason):
+            case do.Explain(reason):
                 if job.status_reason != reason:
                     job.status_reason = reason
-            case MarkRunning(reason, moment):
-                self._mark_running(session, job, attempt, reason, moment)
-            case Decide(verdict):
+            case do.MarkRunning(reason, moment):
+                job.started_at = attempt.started_at = now()
+                attempt.running_since = moment
+                if (array := session.get(Job, job.parent) if job.parent else None) and array.started_at is None:
+                    array.started_at = job.started_at
+                job.move(Status.RUNNING, reason)
+            case do.Decide(verdict):
                 attempt.ending, attempt.status_reason = verdict.ending, verdict.reason
                 attempt.exit_code, attempt.fault = verdict.exit_code, verdict.fault
                 if verdict.start_error is not None:
                     attempt.nodes[job.gang.main].reason = verdict.start_error
-            case Stop():
+            case do.Stop():
                 return self._stop(job, attempt, opened, instruction)
-            case WindUp():
+            case do.WindUp():
                 return Gone(self.clock.now(), [], "")
         return None
 
     def _prepare(
         self, session: Session, job: Job, attempt: Attempt, opened: _Open
-    ) -> Prepared | PrepareDelayed | PrepareRefused | Delayed | None:
-        """Look at the run, record its owner, then take it."""
+    ) -> Prepared | Delayed | Refused | None:
+        """Read the run, record its owner, then take it."""
         key = opened.key
         try:
             if opened.run is None:
@@ -269,9 +246,9 @@ class Attempts:
                 opened.taking = self._take(session, job, attempt, opened.run)
             epoch = self._errands.result(key, "claim", opened.taking, again=False)
         except StoreUnavailable as error:
-            return PrepareDelayed(str(error))
+            return Delayed(str(error), idle=True)
         except (RunRefused, ValueError) as error:
-            return PrepareRefused(str(error))
+            return Refused(str(error))
         return Prepared(epoch) if epoch is not None else self._errands.delayed(key)
 
     def _take(self, session: Session, job: Job, attempt: Attempt, run: ObservedRun) -> Callable[[], int]:
@@ -298,9 +275,9 @@ class Attempts:
         try:
             return Launched(self.engine.launch(_name(attempt), [node.host for node in attempt.nodes], plan, again))
         except NotYet as wait:
-            return LaunchDelayed(str(wait), wait.unknown)
+            return Delayed(str(wait), idle=not wait.unknown)
         except EngineError as error:
-            return LaunchRefused(str(error), is_final=not isinstance(error, CannotStart))
+            return Refused(str(error), is_final=not isinstance(error, CannotStart))
 
     def gang(self, job: Job, attempt: Attempt, spec: GangSpec, options: Mapping[str, str]) -> Gang:
         """The gang that the engine starts for an attempt; ``options``: those of its compute environment and queue."""
@@ -337,15 +314,7 @@ class Attempts:
             notes=notes_of(job, attempt),
         )
 
-    @staticmethod
-    def _mark_running(session: Session, job: Job, attempt: Attempt, reason: str, moment: int) -> None:
-        job.started_at = attempt.started_at = now()
-        attempt.running_since = moment
-        if (array := session.get(Job, job.parent) if job.parent else None) and array.started_at is None:
-            array.started_at = job.started_at
-        job.move(Status.RUNNING, reason)
-
-    def _stop(self, job: Job, attempt: Attempt, opened: _Open, stop: Stop) -> Gone | Delayed | None:
+    def _stop(self, job: Job, attempt: Attempt, opened: _Open, stop: do.Stop) -> Gone | Delayed | None:
         """Stop the gang in the background. Where the engine can't stop it, it is asked again at growing intervals."""
         key = opened.key
         assert attempt.handle is not None
@@ -405,7 +374,9 @@ class Attempts:
             else:
                 self._open.pop(opened.key[0])
 
-    def _close(self, session: Session, job: Job, attempt: Attempt, opened: _Open, close: Close) -> Callable[[], None]:
+    def _close(
+        self, session: Session, job: Job, attempt: Attempt, opened: _Open, close: do.Close
+    ) -> Callable[[], None]:
         """Record the end; returns what follows the commit."""
 
         def closed() -> None:
@@ -421,16 +392,13 @@ class Attempts:
             log.warning("job %s: %s", job.id, close.reason)
         charge(attempt, opened.progress.saved if opened.progress else None, close.moment)
         opened.uncommitted.append(self.monitoring.ended(job, attempt))
-        self._charge_share(session, job, attempt, close.moment)
+        if (policy := self._rows.policy(job.queue)) is not None:
+            decay, seconds = policy.fairshare.get("shareDecaySeconds"), resource_seconds(attempt, close.moment)
+            add_usage(session, job.queue, job.share or "", seconds, decay or DEFAULT_DECAY, close.moment)
         job.move(close.status, close.reason)
         if job.stopped_at is not None:
             job.stopped_at = max(job.stopped_at, attempt.stopped_at)
         return closed
-
-    def _charge_share(self, session: Session, job: Job, attempt: Attempt, moment: int) -> None:
-        if (policy := self._rows.policy(job.queue)) is not None:
-            decay = policy.fairshare.get("shareDecaySeconds") or DEFAULT_DECAY
-            add_usage(session, job.queue, job.share or "", resource_seconds(attempt, moment), decay, moment)
 
 
 def _is_open(job: Job, attempt: Attempt) -> bool:

@@ -19,7 +19,7 @@ import os
 import secrets
 import socket
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -45,46 +45,28 @@ from shared_store.volume.files import DamagedFile, json_object, write_atomic
 
 log = logging.getLogger("muster.bus")
 
+_NODES = "muster/*/*/*"
+_RULES = (  # flow, messages, keys below those of a node
+    ("ingress", ["put"], ["progress", "log"]),
+    ("ingress", ["liveliness_token"], ["alive/*"]),
+    ("ingress", ["declare_queryable", "reply"], ["command/*"]),
+    ("egress", ["query"], ["command/*"]),
+)
 _ACCESS = {
     "enabled": True,
     "default_permission": "deny",
     "rules": [
         {
-            "id": "nodes-report",
+            "id": f"nodes-{number}",
             "permission": "allow",
-            "flows": ["ingress"],
-            "messages": ["put"],
-            "key_exprs": ["muster/*/*/*/progress", "muster/*/*/*/log"],
-        },
-        {
-            "id": "nodes-are-present",
-            "permission": "allow",
-            "flows": ["ingress"],
-            "messages": ["liveliness_token"],
-            "key_exprs": ["muster/*/*/*/alive/*"],
-        },
-        {
-            "id": "nodes-answer",
-            "permission": "allow",
-            "flows": ["ingress"],
-            "messages": ["declare_queryable", "reply"],
-            "key_exprs": ["muster/*/*/*/command/*"],
-        },
-        {
-            "id": "controller-commands",
-            "permission": "allow",
-            "flows": ["egress"],
-            "messages": ["query"],
-            "key_exprs": ["muster/*/*/*/command/*"],
-        },
+            "flows": [flow],
+            "messages": messages,
+            "key_exprs": [f"{_NODES}/{key}" for key in keys],
+        }
+        for number, (flow, messages, keys) in enumerate(_RULES)
     ],
     "subjects": [{"id": "nodes"}],
-    "policies": [
-        {
-            "rules": ["nodes-report", "nodes-are-present", "nodes-answer", "controller-commands"],
-            "subjects": ["nodes"],
-        }
-    ],
+    "policies": [{"rules": [f"nodes-{number}" for number in range(len(_RULES))], "subjects": ["nodes"]}],
 }
 """Access rules for messages between the router and a node. Zenoh reads rules and users once, when the router starts, so that they can't name
 attempts; the proofs do that. The controller's own session is inside the router: no rule applies to it."""
@@ -176,7 +158,7 @@ class Bus:
         except Unavailable as error:
             trouble = str(error)
             self.close()
-        log.warning("the bus is off: %s; jobs run, commands to them do not", trouble)
+        log.warning("the bus is off: %s; jobs run without commands and live lines", trouble)
 
     def _try(self, port: int) -> bool:
         import zenoh
@@ -186,7 +168,6 @@ class Bus:
         line = f"muster:{self._credential('', 0).password}\n".encode()
         if not users.exists() or users.read_bytes() != line:
             write_atomic(users, line, mode=0o600)
-        config = zenoh.Config()
         settings = {
             "mode": "router",
             "listen/endpoints": [f"tcp/{address}:{port}" for address in ("127.0.0.1", *self._addresses)],
@@ -198,18 +179,16 @@ class Bus:
             "transport/auth/usrpwd/dictionary_file": str(users),
             "access_control": _ACCESS,
         }
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
         direct = zenoh.handlers.Callback  # they run on the network's thread, and only note what came
         try:
             with _receiving_threads():
-                self._session = zenoh.open(config)
+                self._session = _opened(settings)
             self._declared = [
                 self._session.liveliness().declare_subscriber(
-                    "muster/*/*/*/alive/*", direct(self._presence, indirect=False), history=True
+                    f"{_NODES}/alive/*", direct(self._presence, indirect=False), history=True
                 ),
-                self._session.declare_subscriber("muster/*/*/*/progress", direct(self._note, indirect=False)),
-                self._session.declare_subscriber("muster/*/*/*/log", direct(self._take_log, indirect=False)),
+                self._session.declare_subscriber(f"{_NODES}/progress", direct(self._note, indirect=False)),
+                self._session.declare_subscriber(f"{_NODES}/log", direct(self._take_log, indirect=False)),
             ]
             self._hear_itself(port)
         except zenoh.ZError as error:
@@ -219,9 +198,6 @@ class Bus:
         return True
 
     def _hear_itself(self, port: int) -> None:
-        import zenoh
-
-        config = zenoh.Config()
         credential = self._credential(*_ITSELF[:2])
         settings = {
             "mode": "client",
@@ -231,9 +207,7 @@ class Bus:
             "transport/auth/usrpwd/user": "muster",
             "transport/auth/usrpwd/password": credential.password,
         }
-        for key, value in settings.items():
-            config.insert_json5(key, json.dumps(value))
-        self._loopback = zenoh.open(config)
+        self._loopback = _opened(settings)
         self._declared.append(self._loopback.liveliness().declare_token(presence_key(credential, *_ITSELF)))
 
     def close(self) -> None:
@@ -272,13 +246,12 @@ class Bus:
             raise BusError("the bus is off; start the controller again to send commands")
         import zenoh
 
-        credential, number = self._credential(job, attempt), secrets.token_hex(16)
         key = f"{prefix(job, attempt, node)}/command/{name}"
-        request = {"id": number, "proof": credential.prove("command", key, number)}
+        credential, number, request = self._request(job, attempt, key)
         # all that declare this key are asked, and all answers read: one that another job forged must not hide the node's
         replies = self._session.get(
             key,
-            payload=json.dumps(request),
+            payload=request,
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=seconds,
@@ -296,34 +269,35 @@ class Bus:
             return
         import zenoh
 
-        key, number = log_command(job, attempt), secrets.token_hex(16)
-        request = {"id": number, "proof": self._credential(job, attempt).prove("command", key, number)}
+        key = log_command(job, attempt)
+        _, _, request = self._request(job, attempt, key)
         ignore: Any = zenoh.handlers.Callback(lambda _: None, indirect=False)
         with contextlib.suppress(zenoh.ZError):  # the next time
-            self._session.get(
-                key, ignore, payload=json.dumps(request), target=zenoh.QueryTarget.ALL, timeout=_UNANSWERED
-            )
+            self._session.get(key, ignore, payload=request, target=zenoh.QueryTarget.ALL, timeout=_UNANSWERED)
+
+    def _request(self, job: str, attempt: int, key: str) -> tuple[Credential, str, str]:
+        """The attempt's credential, a new number, and the payload of the command with this key and number."""
+        credential, number = self._credential(job, attempt), secrets.token_hex(16)
+        return credential, number, json.dumps({"id": number, "proof": credential.prove("command", key, number)})
 
     def _credential(self, job: str, attempt: int) -> Credential:
         return Credential.derive(self._master, job, attempt)
 
     def _presence(self, sample: Any) -> None:
-        key = str(sample.key_expr)
-        node = node_of(key)
+        key, node = _address(sample)
         if node is None or not (node == _ITSELF or self.presence.expects(node)):
             return
         if not hmac.compare_digest(key.encode(), presence_key(self._credential(*node[:2]), *node).encode()):
             return
-        here = str(sample.kind).endswith("PUT")
+        is_present = str(sample.kind).endswith("PUT")
         if node == _ITSELF:
-            self.presence.hear_itself(here)
+            self.presence.hear_itself(is_present)
             return
-        (self.presence.came if here else self.presence.left)(node)
+        (self.presence.came if is_present else self.presence.left)(node)
         self.changed(node[0])
 
     def _note(self, sample: Any) -> None:
-        key = str(sample.key_expr)
-        node = node_of(key)
+        key, node = _address(sample)
         if node is None or sample.attachment is None or not self.presence.expects(node):
             return
         payload, proof = sample.payload.to_bytes(), sample.attachment.to_bytes()
@@ -342,8 +316,7 @@ class Bus:
                 self._progress[node] = progress
 
     def _take_log(self, sample: Any) -> None:
-        key = str(sample.key_expr)
-        node = node_of(key)
+        key, node = _address(sample)
         if (
             node is None
             or sample.attachment is None
@@ -360,6 +333,16 @@ class Bus:
             self.pushed(node, position, data)
 
 
+def _opened(settings: Mapping[str, Any]) -> Any:
+    """A Zenoh session with these settings."""
+    import zenoh
+
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
 @contextlib.contextmanager
 def _receiving_threads() -> Iterator[None]:
     """Zenoh reads the variable when the process opens its first session. Nothing that this process starts inherits it."""
@@ -371,6 +354,12 @@ def _receiving_threads() -> Iterator[None]:
         yield
     finally:
         del os.environ["ZENOH_RUNTIME"]
+
+
+def _address(sample: Any) -> tuple[str, Node | None]:
+    """The key of a message, and the node that it names; None where it names none."""
+    key = str(sample.key_expr)
+    return key, node_of(key)
 
 
 def _message(payload: bytes) -> dict[str, Any]:

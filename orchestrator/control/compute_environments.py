@@ -1,7 +1,7 @@
 """The built-in queues and compute environments: one of each for every engine.
 
 A job goes to an engine by its queue. The queue ``default`` is that of the first engine, unless it was given others, or has jobs of another
-engine that are not over.
+engine that have not ended.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def in_order(session: Session, engines: Sequence[str]) -> list[str]:
     moved = select(func.count()).where(Job.queue.in_([*queues, "default"]), Job.status.not_in(TERMINAL))
     if not (count := session.scalar(moved)):
         return list(engines)
-    jobs = f"{counted(count, 'job')} in it {'is' if count == 1 else 'are'} not over"
+    jobs = f"{counted(count, 'job')} in it {'has' if count == 1 else 'have'} not ended"
     if before not in engines:
         log.warning("queue default moves from engine %s, which is not served, to engine %s: %s", before, first, jobs)
         return list(engines)

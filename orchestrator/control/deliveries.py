@@ -1,7 +1,7 @@
 """Delivering webhooks: a row for each message, written in the transaction that ends its job, and a thread for each receiver.
 
 A message is delivered at least once: its row goes when the receiver has answered 2xx. It has the same ``webhook-id`` and the same body
-at each try. A receiver that is slow or away keeps neither jobs nor other receivers waiting.
+at each try. A receiver that is slow or unreachable keeps neither jobs nor other receivers waiting.
 """
 
 from __future__ import annotations
@@ -37,9 +37,10 @@ from shared_store.volume.evaluations import by_checkpoint, evaluation_name, list
 from shared_store.volume.layout import Run
 
 TIMEOUT = 10.0
-"""Seconds that one try may take in all: connecting, sending, and the answer's status."""
+"""Seconds that one try may take in all: connecting, sending, and the response's status."""
 _IDLE = 5.0
-"""Seconds between two looks for due messages, where nothing wakes the thread."""
+"""Seconds between two queries for due messages, where nothing wakes the thread."""
+_REMOVED = "the webhook was removed from the configuration"
 _SHOWN = ("mean_return", "mean_length", "max_length", "episodes")
 
 log = logging.getLogger("muster.webhooks")
@@ -68,8 +69,7 @@ class Deliveries:
         if self.webhooks:  # a controller without any, such as that of `muster run`, leaves what waits to the next one
             with suppress(DatabaseError), self._controller.writes.lock, self._database.session() as session:
                 gone = WebhookDelivery.webhook.not_in(list(self.webhooks)), WebhookDelivery.next_at.is_not(None)
-                said = "no webhook is called so any more"
-                session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=said))
+                session.execute(update(WebhookDelivery).where(*gone).values(next_at=None, problem=_REMOVED))
                 self._name_unknown_queues(session.scalars(select(JobQueue.name)).all())
         for webhook in self.webhooks.values():
             self._threads.append(machine.thread(f"webhook {webhook.name}", partial(self._loop, webhook)))
@@ -132,10 +132,10 @@ class Deliveries:
     def _loop(self, webhook: Webhook) -> None:
         wake = self._wake[webhook.name]
         while not self._ending.is_set():
-            wake.clear()  # before the look: what is committed after it wakes the thread
+            wake.clear()  # before the query: what is committed after it wakes the thread
             try:
-                pause = _IDLE if self._controller.reconciler.trouble is not None else self._deliver_next(webhook)
-            except DatabaseError:  # said by the controller
+                pause = _IDLE if self._controller.trouble is not None else self._deliver_next(webhook)
+            except DatabaseError:  # reported by the controller
                 pause = _IDLE
             except Exception as error:
                 self._backoff.failed(("bug", webhook.name), f"webhook {webhook.name}: {type(error).__name__}", error)
@@ -171,8 +171,8 @@ class Deliveries:
                 session.delete(row)
             else:
                 row.tries, row.problem = row.tries + 1, problem
-                is_over = final or row.tries > len(self._pauses)
-                row.next_at = None if is_over else now() + int(1000 * self._pauses[row.tries - 1])
+                is_given_up = final or row.tries > len(self._pauses)
+                row.next_at = None if is_given_up else now() + int(1000 * self._pauses[row.tries - 1])
         if problem is None:
             monitoring.webhook_tried(webhook.name, "delivered")
             if self._backoff.worked(webhook.name):
@@ -186,19 +186,19 @@ class Deliveries:
             )
 
     def _send(self, webhook: Webhook, identity: str, body: bytes) -> str | None:
-        """Try once; returns the problem, None where the receiver accepted the message. Only the status of the answer counts.
+        """Try once; returns the problem, None where the receiver accepted the message. Only the status of the response counts.
 
         It has an event loop of its own: that way a try can be cancelled at any point, such as while a receiver sends a byte a second. Nothing
-        of the answer is read behind its header.
+        of the response is read behind its header.
         """
         headers = {"user-agent": f"muster/{__version__}", **webhook.headers(identity, int(machine.wall()), body)}
 
         async def deliver() -> str | None:
             async with (
                 httpx.AsyncClient(timeout=None, verify=self._tls, follow_redirects=False) as http,
-                http.stream("POST", webhook.url, content=body, headers=headers) as answer,
+                http.stream("POST", webhook.url, content=body, headers=headers) as response,
             ):
-                return None if answer.is_success else f"answered {answer.status_code}"
+                return None if response.is_success else f"answered {response.status_code}"
 
         loop = asyncio.new_event_loop()
         try:
@@ -247,7 +247,7 @@ def _evaluated(run: Run, job: Job) -> tuple[str | None, Mapping[str, Any] | None
     """The checkpoint that a message names, and its evaluation: the evaluated one for a job that evaluates, else the newest."""
     if kind_of(job) == "train" and is_of_earlier_run(job, run):
         return None, None
-    with suppress(OSError, ValueError):  # a volume that is away: the message does without
+    with suppress(OSError, ValueError):  # an unavailable volume: the message does without
         if kind_of(job) in evaluating():
             own = (
                 each for each in list_evaluations(run) if each["name"] == evaluation_name(each["checkpoint"], job.id)

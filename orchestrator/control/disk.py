@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,10 +10,10 @@ from functools import partial
 from pathlib import Path
 
 from orchestrator import machine
+from orchestrator.domain.units import BYTES, amount
 
-_UNITS = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 _INTERVAL = 0.5
-"""Seconds between two looks at a volume."""
+"""Seconds between two examinations of a volume."""
 _PATIENCE = 5.0
 """Seconds after which a volume counts as not answering."""
 
@@ -31,12 +30,14 @@ class MinFree:
     @classmethod
     def parse(cls, text: str) -> MinFree:
         """``512MiB``, ``5%`` or ``0``. Raises ValueError."""
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(%|[KMGT]i?B)?", text.strip())
-        if not match or (match[2] is None and float(match[1])) or (match[2] == "%" and float(match[1]) > 100):
-            raise ValueError("expected a size such as 1GiB, a share such as 5%, or 0")
-        if match[2] == "%":
-            return cls(share=float(match[1]) / 100)
-        return cls(size=int(float(match[1]) * _UNITS.get(match[2], 1)))
+        expected = "a size such as 1GiB, a share such as 5%, or 0"
+        if text.strip() == "0":
+            return cls(size=0)
+        if not text.strip().endswith("%"):
+            return cls(size=int(amount(text, BYTES, expected)))
+        if (percent := amount(text, {"%": 1}, expected)) > 100:
+            raise ValueError(f"expected {expected}")
+        return cls(share=percent / 100)
 
     def of(self, total: int) -> int:
         """Bytes of a volume of ``total`` bytes."""
@@ -50,14 +51,14 @@ DEFAULT = MinFree(size=1 << 30, share=0.05)
 
 @dataclass
 class _Volume:
-    """One volume, and the result of the last look at it."""
+    """One volume, and the result of its last examination."""
 
     name: str
     path: Path
     short: str | None = None
     absent: str | None = None
     began: machine.Moment | None = None
-    """Start of the look under way."""
+    """Start of the examination under way."""
 
 
 class Disk:
@@ -69,7 +70,7 @@ class Disk:
         minimum: MinFree = DEFAULT,
         checks: Mapping[str, Callable[[], str | None]] | None = None,
     ) -> None:
-        """Look once at each volume. ``volumes``: a directory on each, by the purpose of the volume, such as ``store``.
+        """Examine each volume once. ``volumes``: a directory on each, by the purpose of the volume, such as ``store``.
 
         ``checks``: by purpose, what says that another volume is in its place; may hang.
         """
@@ -77,7 +78,7 @@ class Disk:
         self._checks = checks or {}
         self._ended = threading.Event()
         for volume in self._volumes:
-            volume.short = self._look(volume)
+            volume.short = self._examine(volume)
 
     @property
     def names(self) -> list[str]:
@@ -85,12 +86,12 @@ class Disk:
         return [volume.name for volume in self._volumes]
 
     def start(self) -> None:
-        """Look at each volume about once a second, in a thread of its own: one that hangs keeps no other waiting."""
+        """Examine each volume about once a second, in a thread of its own: one that hangs keeps no other waiting."""
         for volume in self._volumes:
             machine.thread(f"volume {volume.name}", partial(self._watch, volume))
 
     def close(self) -> None:
-        """Stop looking; a look that hangs is abandoned."""
+        """Stop; an examination that hangs is abandoned."""
         self._ended.set()
 
     def shortage(self, purpose: str | None = None) -> str | None:
@@ -101,7 +102,7 @@ class Disk:
         of = (volume for volume in self._volumes if purpose in (None, volume.name))
         return next((why for volume in of if (why := self._silence(volume) or volume.absent or volume.short)), None)
 
-    def away(self, purpose: str) -> str | None:
+    def unavailable(self, purpose: str) -> str | None:
         """Why the volume of this purpose can't be read: it has not answered for a while, or is not there; None where it can, as far as was seen."""
         return next((self._silence(each) or each.absent for each in self._volumes if each.name == purpose), None)
 
@@ -122,10 +123,10 @@ class Disk:
     def _watch(self, volume: _Volume) -> None:
         while not self._ended.wait(_INTERVAL):
             volume.began = machine.moment()
-            volume.short = self._look(volume)
+            volume.short = self._examine(volume)
             volume.began = None
 
-    def _look(self, volume: _Volume) -> str | None:
+    def _examine(self, volume: _Volume) -> str | None:
         """How much too little space is free; notes whether another volume is in its place."""
         check = self._checks.get(volume.name)
         volume.absent = check() if check else None

@@ -6,12 +6,11 @@ Nothing here looks into the store or waits for an engine: a volume that hangs ke
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
-from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client import CollectorRegistry, Metric, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
-from prometheus_client.registry import Collector
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
@@ -33,29 +32,25 @@ _Sums = defaultdict[tuple[str, ...], float]
 
 def exposition(controller: Controller) -> bytes:
     """All of it in Prometheus's text format."""
-    now = CollectorRegistry()
-    now.register(_Moment(controller))
-    return generate_latest(controller.monitoring.registry) + generate_latest(now)
+    return generate_latest(controller.monitoring.registry) + generate_latest(_Moment(controller))
 
 
-class _Moment(Collector):
+class _Moment(CollectorRegistry):
     """The values at the moment of a scrape."""
 
     def __init__(self, controller: Controller) -> None:
+        super().__init__()
         self._controller = controller
 
-    def describe(self) -> Iterable[GaugeMetricFamily]:
-        return ()
-
-    def collect(self) -> Iterator[GaugeMetricFamily | InfoMetricFamily | CounterMetricFamily]:
+    def collect(self) -> Iterator[Metric]:
         controller = self._controller
         yield InfoMetricFamily("muster", "Version of the controller.", value={"version": __version__})
         age = "Seconds since the controller's loop made its last progress; /healthz fails above 5."
-        yield _gauge("muster_loop_age_seconds", age, [], {(): controller.heartbeat.age})
+        yield _gauge("muster_loop_age_seconds", age, [], {(): controller.monitoring.loop_age})
         try:
             with controller.database.session() as session:
                 found = [*self._jobs(session), *self._attempts(session)]
-            usable = controller.reconciler.trouble is None
+            usable = controller.trouble is None
         except DatabaseError:  # then the scrape says this, and what needs no database
             found, usable = [], False
         yield _gauge("muster_database_usable", "1 while the database can be used, else 0.", [], {(): float(usable)})
@@ -84,12 +79,12 @@ class _Moment(Collector):
         trainings = 0
         for job, attempt in open_attempts(session, self._controller.work_queue.active()):
             labels = (job.queue, engine_named(attempt))
-            given = held_by(attempt)
-            held["gpus"][labels] += given.gpus
-            held["cpus"][labels] += given.cpus
+            resources = held_by(attempt)
+            held["gpus"][labels] += resources.gpus
+            held["cpus"][labels] += resources.cpus
             try:
                 main = job.gang.main
-            except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+            except Exception:  # a damaged row, which is reported when the job is settled
                 continue
             progress = self._controller.bus.progress(job.id, attempt.number, main) or {}
             found = {name: value for name in series if isinstance(value := progress.get(name), int | float)}
@@ -110,10 +105,10 @@ class _Moment(Collector):
     def _volumes(self) -> GaugeMetricFamily:
         disk = self._controller.access.disk
         short = {(name,): float(disk.shortage(name) is not None) for name in disk.names}
-        said = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
-        return _gauge("muster_volume_short", said, ["volume"], short)
+        text = "1 while a volume has too little room or does not answer, so that no gang starts, else 0."
+        return _gauge("muster_volume_short", text, ["volume"], short)
 
-    def _store(self) -> Iterator[GaugeMetricFamily | CounterMetricFamily]:
+    def _store(self) -> Iterator[Metric]:
         calls = self._controller.access.calls
         states = {("busy",): float(min(calls.open, THREADS)), ("waiting",): float(max(0, calls.open - THREADS))}
         yield _gauge("muster_store_calls", "Requests that use the store, by state.", ["state"], states)
@@ -123,13 +118,13 @@ class _Moment(Collector):
     def _hosts(self) -> Iterator[GaugeMetricFamily]:
         hosts, gpus, cpus = _Sums(float), _Sums(float), _Sums(float)
         for name, capacity in self._controller.engines.capacity().items():
-            for host in [host for host in capacity.places if not host.away]:
+            for host in [host for host in capacity.places if not host.unavailable]:
                 if not host.queue:
                     hosts[(name,)] += 1
                 gpus[(name,)] += len(host.gpus)
                 cpus[(name,)] += host.cpus
         for name, amounts in (("hosts", hosts), ("gpus", gpus), ("cpus", cpus)):
-            what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as it told them last."
+            what = f"{name if name == 'hosts' else name[:-1].upper() + 's'} of an engine, as last reported."
             yield _gauge(f"muster_{name}", what, ["engine"], amounts)
 
 

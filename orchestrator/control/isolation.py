@@ -1,16 +1,20 @@
-"""The isolation of failures: a part of a pass that fails stops no other part, and a job that fails no other job."""
+"""The isolation of failures: a part of a pass that fails stops no other part, and a job that fails no other job.
+
+The jobs with a gang are as the controller's thread has them loaded: read once, and again after a request has changed them.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 
-from sqlalchemy import update
-from sqlalchemy.orm import Session
+from sqlalchemy import select, update
+from sqlalchemy.orm import Session, selectinload
 
 from orchestrator.control.attempts import Steps
-from orchestrator.control.heartbeat import Heartbeat
-from orchestrator.control.loaded import LoadedJobs
+from orchestrator.control.monitoring import Monitoring
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import TERMINAL
 from orchestrator.engines.toolkit.backoff import Backoff
@@ -24,11 +28,73 @@ _AT_ONCE = 1000
 log = logging.getLogger("muster.controller")
 
 
+class LoadedJobs:
+    """One session that stays open between the passes of the loop, without a transaction."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._lock = threading.Lock()
+        self._changed: set[str] = set()
+        """Ids of jobs that were changed elsewhere since they were loaded."""
+        self._jobs: dict[str, Job] = {}
+        self._session: Session | None = None
+        self.reread: Callable[[Collection[str]], None] = lambda ids: None
+        """Called with the jobs that are read from the database, also those that were known before."""
+
+    def changed(self, ids: Collection[str]) -> None:
+        """These jobs were changed elsewhere. Any thread may call."""
+        with self._lock:
+            self._changed.update(ids)
+
+    @contextmanager
+    def session(self) -> Iterator[Session]:
+        """The session, committed at the end of the block; after an error everything is read anew.
+
+        Raises DatabaseError.
+        """
+        if self._session is None:
+            self._session = self._database.open()
+        try:
+            with self._database.using(self._session):
+                yield self._session
+        except BaseException:
+            self.forget()
+            raise
+
+    def jobs(self, session: Session, ids: Sequence[str]) -> Mapping[str, Job]:
+        """Those of these jobs that exist, with their attempts."""
+        with self._lock:
+            changed, self._changed = self._changed, set()
+        for job_id in changed:
+            if (job := self._jobs.pop(job_id, None)) is not None:
+                session.expire(job)
+        if missing := [job_id for job_id in ids if job_id not in self._jobs]:
+            self.reread(missing)
+            query = select(Job).where(Job.id.in_(missing)).options(selectinload(Job.attempts))
+            self._jobs |= {job.id: job for job in session.scalars(query.execution_options(populate_existing=True))}
+        return {job_id: self._jobs[job_id] for job_id in ids if job_id in self._jobs}
+
+    def keep(self, ids: Collection[str]) -> None:
+        """Forget all but these jobs."""
+        for job_id in self._jobs.keys() - ids:
+            job = self._jobs.pop(job_id)
+            if self._session is not None and job in self._session:
+                # it and its attempts refer to one another: so they go at once, without a search for garbage
+                self._session.expire(job, ["attempts"])
+
+    def forget(self) -> None:
+        """Read everything anew."""
+        self._jobs = {}
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+
+
 class Isolation:
     """Carries out the work of the controller's loop, and remembers what fails. On the controller's thread alone."""
 
-    def __init__(self, database: Database, loaded: LoadedJobs, heartbeat: Heartbeat) -> None:
-        self._database, self._loaded, self._heartbeat = database, loaded, heartbeat
+    def __init__(self, database: Database, loaded: LoadedJobs, monitoring: Monitoring) -> None:
+        self._database, self._loaded, self._monitoring = database, loaded, monitoring
         self.trouble: str | None = None
         """Why the database can't be used at present: nothing is launched, and no request is accepted."""
         self.is_full = False
@@ -64,13 +130,13 @@ class Isolation:
         return [failed for portion in portions for failed in self._together(what, portion, body)]
 
     def _together(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
-        self._heartbeat.beat()
+        self._monitoring.beat()
         try:
             with self._loaded.session() as session:
                 jobs = self._loaded.jobs(session, ids)
                 self.before(session, list(jobs.values()))
-                begun = [body(session, job) for job in jobs.values()]
-                self._finish(session, [steps for steps in begun if steps is not None])
+                started = [body(session, job) for job in jobs.values()]
+                self._finish(session, [steps for steps in started if steps is not None])
         except DatabaseError:
             raise
         except Exception as error:
@@ -92,7 +158,7 @@ class Isolation:
             for _, then in reached:
                 then()
             steps = [each for each, _ in reached]
-            self._heartbeat.beat()
+            self._monitoring.beat()
 
     def _failed(self, what: str, job_id: str, error: Exception) -> None:
         """Note a failure of a job: logged once, shown as its reason, and tried again at growing intervals."""

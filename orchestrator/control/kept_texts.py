@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from sqlalchemy import String, cast, func, select, update
+from sqlalchemy import String, cast, delete, func, select, update
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
@@ -37,7 +37,7 @@ DAYS = 7
 A_DAY = 32 << 20
 """Bytes of texts that one key may upload in 24 hours."""
 _SWEEP_INTERVAL, _FIRST_SWEEP = 3600.0, 60.0
-"""Seconds between two looks for texts that nothing needs, and until the first one."""
+"""Seconds between two searches for texts that nothing needs, and until the first one."""
 _MS_A_DAY = 24 * 3600 * 1000
 
 
@@ -136,7 +136,10 @@ class KeptTexts:
         try:
             with self._changing:
                 with self._writing, self._database.session() as session:
-                    unneeded = _forget_unneeded(session, now() - DAYS * _MS_A_DAY)
+                    old = session.scalars(select(KeptText).where(KeptText.used_at < now() - DAYS * _MS_A_DAY)).all()
+                    named = _named(session) if old else set()
+                    unneeded = [(row.folder, row.sha256) for row in old if row.sha256 not in named]
+                    session.execute(delete(KeptText).where(KeptText.sha256.in_(name for _, name in unneeded)))
                 for folder, name in unneeded:
                     (self._store.texts / folder / name).unlink(missing_ok=True)
                     deleted.append(name)
@@ -171,16 +174,6 @@ def _digest(data: bytes) -> str:
         return texts.digest_of(data.decode())
     except UnicodeDecodeError:
         raise TextRefused("it is not a text (UTF-8)") from None
-
-
-def _forget_unneeded(session: Session, moment: int) -> list[tuple[str, str]]:
-    """Delete the rows of texts that were used before ``moment`` [ms] and that nothing names; returns folder and digest of each."""
-    old = session.scalars(select(KeptText).where(KeptText.used_at < moment)).all()
-    named = _named(session) if old else set()
-    unneeded = [row for row in old if row.sha256 not in named]
-    for row in unneeded:
-        session.delete(row)
-    return [(row.folder, row.sha256) for row in unneeded]
 
 
 def _named(session: Session) -> set[str]:

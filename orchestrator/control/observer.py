@@ -14,13 +14,13 @@ from orchestrator.control.node_ends import node_end
 from orchestrator.control.run_store import Errands, Key, RunContent, RunStore
 from orchestrator.domain.attempt_events import Observed, Silence
 from orchestrator.domain.job import NodeEnd, aws_ending
-from orchestrator.engines.api import GangStatus, NodePhase, NodeStatus
+from orchestrator.engines.api import GangStatus, NodePhase
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.batch_models import Attempt, Job, Node, now
 from shared_store.volume.node_outcomes import Outcome
 
 CHECK_INTERVAL = 5.0
-"""Seconds between two looks at a gang of which a node can't be seen or heard, or whose cause is not known yet."""
+"""Seconds between two observations of a gang of which a node can't be seen or heard, or whose cause is not known yet."""
 
 
 @dataclass
@@ -34,11 +34,11 @@ class _Seen:
     progress: RunContent | None = None
     """What the run holds, read after the last of them was found."""
     has_hidden: bool = False
-    """Whether a node could not be seen or heard at the last look."""
+    """Whether a node could not be seen or heard at the last observation."""
 
 
 class Observer:
-    """Looks at gangs. On the controller's thread alone, which never waits here for an engine or the store."""
+    """Observes gangs. On the controller's thread alone, which never waits here for an engine or the store."""
 
     def __init__(self, engine: EngineSet, runs: RunStore, errands: Errands, bus: Bus, clock: Clock) -> None:
         self._engine, self._runs, self._errands, self._bus, self._clock = engine, runs, errands, bus, clock
@@ -49,16 +49,16 @@ class Observer:
         self._seen.pop(key, None)
 
     def observe(self, job: Job, attempt: Attempt) -> Observed | None:
-        """A look at a gang that was launched; None before its engine's first look."""
+        """An observation of a gang that was launched; None before its engine's first poll."""
         assert attempt.handle is not None
         key = job.id, attempt.number
         status = self._engine.observe(attempt.handle)
         if status is None:
-            return None  # the engine's first look is under way
+            return None  # the engine's first poll is under way
         silences = self._silences(key, attempt.handle, status)
         known = self.know_outcomes(job, attempt, status, silences)
         ends = self.ends(job, attempt, status)
-        head, away = status[job.gang.main], (node.words for node in status if node.phase is NodePhase.UNREACHABLE)
+        head, unseen = status[job.gang.main], (node.words for node in status if node.phase is NodePhase.UNREACHABLE)
         return Observed(
             moment=self._clock.now(),
             ends=ends,
@@ -66,28 +66,29 @@ class Observer:
             unread=None if known else self._errands.trouble(key),
             waits=head.words
             if head.phase not in (NodePhase.RUNNING, NodePhase.ENDED) and ends[job.gang.main] is None
-            else ("" if known else next(away, "")),
+            else ("" if known else next(unseen, "")),
             words=head.words if head.running else "",
             stale=next((node.stale for node in status if node.stale), ""),
         )
 
     def has_hidden(self, key: Key) -> bool:
-        """Whether a node of the attempt could not be seen or heard at the last look, and has left no outcome."""
+        """Whether a node of the attempt could not be seen or heard at the last observation, and has left no outcome."""
         return key in self._seen and self._seen[key].has_hidden
 
     def _silences(self, key: Key, handle: str, status: GangStatus) -> Sequence[Silence | None]:
         """The silence of each node, by what the engine and the store say of it; None for one that has ended."""
         seen = self._seen[key]
-        asked = self._engine.status_age(handle)
-        asked = None if asked is None or seen.checked is None else max(asked, machine.monotonic() - seen.checked)
+        age = self._engine.status_age(handle)
+        age = None if age is None or seen.checked is None else max(age, machine.monotonic() - seen.checked)
 
-        def silence(index: int, node: NodeStatus) -> Silence | None:
-            if not node.running or self._bus.endpoint is None:
-                return None
-            runs = node.phase is not NodePhase.UNREACHABLE and not node.stale
-            return self._bus.presence.silence((*key, index), asked, runs)
-
-        return [silence(*each) for each in enumerate(status)]
+        if self._bus.endpoint is None:
+            return [None] * len(status)
+        return [
+            self._bus.presence.silence((*key, index), age, node.phase is not NodePhase.UNREACHABLE and not node.stale)
+            if node.running
+            else None
+            for index, node in enumerate(status)
+        ]
 
     def know_outcomes(self, job: Job, attempt: Attempt, status: GangStatus, silences: Sequence[Silence | None]) -> bool:
         """Read the outcomes of nodes that have ended, and now and then of those that can't be seen or heard.
@@ -96,7 +97,7 @@ class Observer:
             job: The job.
             attempt: Its open attempt.
             status: Of each node.
-            silences: Of each node, at the same look.
+            silences: Of each node, at the same observation.
 
         Returns:
             Whether those of the nodes that have ended are known.
@@ -120,8 +121,8 @@ class Observer:
         if found is None:
             return not ended
         # of the call that has returned: a node that has ended since may have left its outcome after it was looked for
-        memory.checked, over, outcomes, memory.progress = found
-        memory.outcomes |= {**dict.fromkeys(over), **outcomes}
+        memory.checked, finished, outcomes, memory.progress = found
+        memory.outcomes |= {**dict.fromkeys(finished), **outcomes}
         return all(index in memory.outcomes for index in ended) or self.know_outcomes(job, attempt, status, silences)
 
     def _read(
@@ -158,7 +159,7 @@ class Observer:
 
 
 def _note(record: Node, **facts: object) -> None:
-    """Note what is new: a look that finds nothing new changes no row."""
+    """Note what is new: an observation of nothing new changes no row."""
     for name, value in facts.items():
         if getattr(record, name) != value:
             setattr(record, name, value)

@@ -66,7 +66,7 @@ class Peers:
 
     def start(self) -> None:
         """Leave the first heartbeat; log a warning for each other controller that is present, now and later."""
-        self._look()
+        self._poll()
         self._thread = machine.thread("peers", self._loop)
 
     def close(self) -> None:
@@ -74,7 +74,7 @@ class Peers:
         self._ending.set()
         if self._thread is not None:
             self._thread.join(BEAT)
-        with contextlib.suppress(OSError):  # a volume that is away: the heartbeat goes out of date
+        with contextlib.suppress(OSError):  # an unavailable volume: the heartbeat goes out of date
             self._path.unlink(missing_ok=True)
 
     def writer(self, run: Run) -> str | None:
@@ -88,14 +88,11 @@ class Peers:
             return None
         if claim.controller not in self._seen and (found := self._read(claim.controller)):
             self._note(claim.controller, found)  # it started after the last look
-        if (peer := self._present(claim.controller)) is None:
+        with self._lock:
+            peer, heard = self._seen.get(claim.controller, (None, None))
+        if peer is None or heard is None or machine.monotonic() - heard >= GONE:
             return None
         return f"job {short_id(claim.job)} (attempt {claim.attempt}) of {peer}"
-
-    def _present(self, controller: str) -> Peer | None:
-        with self._lock:
-            peer, heard = self._seen.get(controller, (None, None))
-        return peer if heard is not None and machine.monotonic() - heard < GONE else None
 
     @property
     def _path(self) -> Path:
@@ -103,9 +100,9 @@ class Peers:
 
     def _loop(self) -> None:
         while not self._ending.wait(BEAT):
-            self._look()
+            self._poll()
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Leave a heartbeat and read the others'; where the store is unavailable, the next heartbeat makes up for it."""
         self._beat += 1
         own = Peer(str(self._home), socket.gethostname(), os.getpid(), self._beat, machine.wall())

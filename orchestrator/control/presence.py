@@ -149,14 +149,14 @@ class Presence:
             since = self._deaf_since
         return why if since is not None and self._monotonic() - since > UNHEARD else None
 
-    def silence(self, node: Node, asked: float | None, runs: bool = True) -> Silence | None:
+    def silence(self, node: Node, age: float | None, runs: bool = True) -> Silence | None:
         """The silence of a node that was connected; None where it is heard, or never was.
 
         One that was connected to an earlier router only is not lost, however long it is missing: it may look for that one.
 
         Args:
             node: The node.
-            asked: Seconds since its engine was asked, and answered; None where it does not answer.
+            age: Seconds since its engine has answered; None where it does not answer.
             runs: Whether it answered that the node runs; otherwise it can't tell.
         """
         with self._lock:
@@ -167,7 +167,7 @@ class Presence:
             if heard is None or heard.gone is None:
                 return None
             deaf = self._note_deafness()
-            if asked is None or asked > min(now - heard.gone, max(_FRESH, self.lost_after / 4)):
+            if age is None or age > min(now - heard.gone, max(_FRESH, self.lost_after / 4)):
                 heard.answered = heard.confirmed = now
             if not runs:
                 heard.confirmed = now

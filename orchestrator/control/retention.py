@@ -1,6 +1,6 @@
 """Retention: takes old jobs, their logs and their runs, in small steps, where nothing needs them (:mod:`orchestrator.domain.retention`).
 
-A run goes in three steps, none of which holds a lock while it waits for the store: under :attr:`Reconciler.writing` it is taken, so that no
+A run goes in three steps, none of which holds a lock while it waits for the store: under the lock of all writes it is taken, so that no
 request uses it any more; it is looked at again, and moved into the store's trash; then the rows of its jobs are deleted. Whatever dies in
 between leaves the run, or rows of jobs whose run is gone: the next pass deletes these.
 """
@@ -18,26 +18,25 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import and_, or_, select
+from sqlalchemy import delete, or_, select
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.peers import Peers
-from orchestrator.control.retention_looks import CONTROLLER, PassCursor, PassTotals, RetentionStep, Step, Whose
-from orchestrator.control.run_facts import StoredRuns
-from orchestrator.control.run_users import RunUsers
+from orchestrator.control.retention_facts import CONTROLLER, PassTotals, Requester, RetentionPlan, Step, StoredRuns
+from orchestrator.control.store_access import StoreAccess
 from orchestrator.domain import retention
 from orchestrator.domain.errors import RequestError, Unavailable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import JobFacts, References, RetentionRules, RunFacts, decide, still_needed
+from orchestrator.domain.retention import A_DAY, JobFacts, References, RetentionRules, RunFacts, decide, still_needed
 from orchestrator.persistence import retention_rows as rows
 from orchestrator.persistence.batch_models import Job, JobQueue, RunRecord, now
-from orchestrator.persistence.own_models import RetentionStart, RunUse
+from orchestrator.persistence.keyset import Cursor, behind
+from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
 from orchestrator.persistence.session import Database
 from shared_store.contract.error_text import counted
 from shared_store.volume import contents, trash
 from shared_store.volume.files import DamagedFile
-from shared_store.volume.layout import NAME, Store
+from shared_store.volume.layout import NAME
 
 log = logging.getLogger("muster.retention")
 
@@ -53,6 +52,8 @@ _FRESH = 600.0
 """Seconds for which what was found in the store counts: what needs a run that is old enough to go seldom comes."""
 _PATIENCE = 10.0
 """Seconds for which the end of a controller waits for a step."""
+_UNUSED = 90 * A_DAY
+"""Milliseconds after which the use of a share is forgotten."""
 _LOGGED = 24 * 3600.0
 """Seconds between two reports of what would go."""
 
@@ -69,31 +70,23 @@ class Retention:
     def __init__(
         self,
         database: Database,
-        store: Store,
-        peers: Peers,
-        users: RunUsers,
-        beginning: Mapping[str, object],
+        access: StoreAccess,
         writing: threading.Lock,
-        check: Callable[[], None],
         steady: Callable[[], int],
         default: float | None = None,
     ) -> None:
         """
         Args:
             database: Of the jobs.
-            store: Of their runs.
-            peers: The other controllers of the store.
-            users: Who uses a run now.
-            beginning: Runs that requests begin now; changes while ``writing`` is held.
+            access: To the store of their runs.
             writing: Held while something is submitted.
-            check: Raises Unavailable where the store is not there: what is missing may be missing for that.
             steady: Steady time [ms]; of two clocks, the one that is behind decides.
             default: Seconds for which jobs of queues without a rule are kept; None: as :class:`RetentionRules` says. Infinity: without end,
                 and nothing goes by itself.
         """
-        self._database, self._store, self._users = database, store, users
-        self._beginning, self._writing, self._steady = beginning, writing, steady
-        self.stored = StoredRuns(store, peers, check)
+        self._database, self._store, self._users = database, access.store, access.users
+        self._beginning, self._writing, self._steady = access.beginning, writing, steady
+        self.stored = StoredRuns(access.store, access.peers, access.check)
         self._is_on = default != inf
         self._default = int(default * 1000) if default is not None and self._is_on else None
         self._removing = machine.pool("emptying the trash", _REMOVERS)
@@ -139,7 +132,8 @@ class Retention:
             return
         self._empty_trash()
         with self._writing, self._database.session() as session:
-            rows.forget_usage(session, self._steady())
+            # of the longest half-life, a week, less than 0.02 % is left
+            session.execute(delete(ShareUsage).where(ShareUsage.as_of < self._steady() - _UNUSED))
         if not self._is_on:
             return
         if self.rules().is_trial(self._moment()):
@@ -177,13 +171,13 @@ class Retention:
             totals,
         )
 
-    def _all(self, step: Callable[[RetentionRules, PassCursor], Step]) -> PassTotals:
+    def _all(self, step: Callable[[RetentionRules, Cursor], Step]) -> PassTotals:
         """Step by step with the rules of each moment, and a rest after each."""
-        totals, place = PassTotals(), PassCursor()
+        totals, place = PassTotals(), Cursor()
         while not self._is_closing.is_set():
             began = machine.processor_time()
-            looks, following = step(self.rules(), place)
-            totals.add(looks)
+            plans, following = step(self.rules(), place)
+            totals.add(plans)
             if following is None:
                 break
             place = following
@@ -212,11 +206,11 @@ class Retention:
 
     def step(
         self,
-        after: PassCursor,
+        after: Cursor,
         rules: RetentionRules,
         *,
         take: bool,
-        whose: Whose = CONTROLLER,
+        by: Requester = CONTROLLER,
         most: int = A_STEP,
     ) -> Step:
         """Look at the next jobs that are old enough, and take what may go.
@@ -224,8 +218,8 @@ class Retention:
         Args:
             after: Where the step before ended.
             rules: As :meth:`rules` answers, or changed.
-            take: Take it; else only look.
-            whose: Who asks.
+            take: Take it; else only plan.
+            by: Who requests it.
             most: Number of jobs.
 
         Returns:
@@ -237,22 +231,19 @@ class Retention:
         moment = self._moment()
         with self._database.session() as session:
             query = select(Job.id, Job.run, Job.stopped_at).where(rows.due(rules, moment))
-            behind = or_(
-                Job.stopped_at > after.stopped_at, and_(Job.stopped_at == after.stopped_at, Job.id < after.job)
-            )
-            query = query.where(behind, Job.stopped_at >= after.stopped_at)
-            if whose.queues is not None:
-                query = query.where(Job.owner == whose.name, Job.queue.in_(whose.queues))
+            query = query.where(behind((Job.stopped_at, Job.id), (after.at, after.id), (False, True)))
+            if by.queues is not None:
+                query = query.where(Job.owner == by.name, Job.queue.in_(by.queues))
             # of equal times an array behind its children
             found = session.execute(query.order_by(Job.stopped_at, Job.id.desc()).limit(most)).all()
-        looks = self._looks({row.run for row in found if NAME.fullmatch(row.run)}, rules, moment, whose)
-        wanted = [look.run for look in looks if look.decision.jobs]
-        described = {look.run: look.described() for look in looks if not take or look.decision.reasons}
-        if take and wanted:
-            taken = self._take(wanted)
+        plans = self._plans({row.run for row in found if NAME.fullmatch(row.run)}, rules, moment, by)
+        going = [plan.run for plan in plans if plan.decision.jobs]
+        described = {plan.run: plan.described() for plan in plans if not take or plan.decision.reasons}
+        if take and going:
+            taken = self._take(going)
             try:
-                again = self._looks(taken, rules, moment, whose)
-                described |= {look.run: look.described() for look in again}
+                again = self._plans(taken, rules, moment, by)
+                described |= {plan.run: plan.described() for plan in again}
                 gone, stay = self._carry_out(again)
                 for run, why in stay.items():
                     described[run] |= {"whole": False, "kept": [why]}
@@ -264,70 +255,70 @@ class Retention:
                 for run in taken:
                     self._users.let_go(run)
         shown = [each for each in described.values() if each["jobs"] or each["kept"]]
-        return shown, PassCursor(found[-1].stopped_at, found[-1].id) if len(found) == most else None
+        return shown, Cursor(found[-1].stopped_at, found[-1].id) if len(found) == most else None
 
     def _take(self, runs: Sequence[str]) -> list[str]:
         """Those of the runs that nobody uses; from now on nobody does."""
         with self._writing:
             return [run for run in runs if run not in self._beginning and self._users.take(run)]
 
-    def _looks(self, runs: Collection[str], rules: RetentionRules, moment: int, whose: Whose) -> list[RetentionStep]:
+    def _plans(self, runs: Collection[str], rules: RetentionRules, moment: int, by: Requester) -> list[RetentionPlan]:
         """What may go of these runs and their jobs. Raises Unavailable, OSError."""
         if not runs:
             return []
         stored = self.stored.references(_FRESH)
         facts = self.stored.facts(runs)
         with self._database.session() as session:  # after the store: what was submitted meanwhile counts
-            jobs = self._jobs(session, runs, rules, moment, whose)
+            jobs = self._jobs(session, runs, rules, moment, by)
             needed = References.of(rows.references(session, runs)) | stored
-        needed = needed if whose.queues is None else needed.unnamed()
-        return [self._look(run, facts[run], jobs[run], needed) for run in sorted(runs)]
+        needed = needed if by.queues is None else needed.unnamed()
+        return [self._plan(run, facts[run], jobs[run], needed) for run in sorted(runs)]
 
     def _jobs(
-        self, session: Session, runs: Collection[str], rules: RetentionRules, moment: int, whose: Whose
+        self, session: Session, runs: Collection[str], rules: RetentionRules, moment: int, by: Requester
     ) -> dict[str, list[JobFacts]]:
         """The jobs of the runs; those of others, and all of a run that is another's, never go."""
         jobs = rows.jobs_of_runs(session, runs, rules, moment)
-        if whose.queues is None:
+        if by.queues is None:
             return jobs
         owners = session.execute(select(Job.id, Job.owner, Job.queue).where(Job.run.in_(runs)))
-        own = {job for job, owner, queue in owners if whose.owns(owner, queue)}
+        own = {job for job, owner, queue in owners if by.owns(owner, queue)}
         records = session.scalars(select(RunRecord).where(RunRecord.name.in_(runs)))
-        others = {record.name for record in records if not whose.owns(record.owner, record.queue)}
+        others = {record.name for record in records if not by.owns(record.owner, record.queue)}
         return {
             run: [each if each.id in own and run not in others else replace(each, is_due=False) for each in of_run]
             for run, of_run in jobs.items()
         }
 
-    def _look(self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References) -> RetentionStep:
+    def _plan(self, name: str, facts: RunFacts | None, jobs: Sequence[JobFacts], needed: References) -> RetentionPlan:
         decision, run = decide(facts, jobs, needed), self._store.run(name)
         if decision.run:
-            return RetentionStep(name, decision, facts, (run.path,))
-        return RetentionStep(
+            return RetentionPlan(name, decision, facts, (run.path,))
+        return RetentionPlan(
             name, decision, facts, tuple(path for job in decision.jobs for path in contents.job_directories(run, job))
         )
 
-    def _carry_out(self, looks: Sequence[RetentionStep]) -> tuple[Collection[str], Mapping[str, str]]:
+    def _carry_out(self, plans: Sequence[RetentionPlan]) -> tuple[Collection[str], Mapping[str, str]]:
         """Move into the trash what goes, delete the rows, and empty the trash.
 
         Returns the jobs that went, and why something of a run stays, by run. Raises Unavailable, OSError.
         """
-        unchanged, stay, gone = list[RetentionStep](), dict[str, str](), set[str]()
+        unchanged, stay, gone = list[RetentionPlan](), dict[str, str](), set[str]()
         self.stored.check()
-        thrown, fixed = trash.throw_away(self._store, self._directories(looks, unchanged, stay))
+        thrown, fixed = trash.throw_away(self._store, self._directories(plans, unchanged, stay))
         self.stored.check()
         self._fixed |= fixed
         going = list[str]()
-        for look in unchanged:
-            held = [path for path in look.directories if path in fixed]
+        for plan in unchanged:
+            held = [path for path in plan.directories if path in fixed]
             if held:
-                stay[look.run] = _unmoved(fixed[held[0]])
-            if not (held and look.decision.run):
-                going += set(look.decision.jobs) - {path.name for path in held}
+                stay[plan.run] = _unmoved(fixed[held[0]])
+            if not (held and plan.decision.run):
+                going += set(plan.decision.jobs) - {path.name for path in held}
         if self._is_closing.is_set():
             return gone, stay  # the next controller deletes the rows
         going.sort(key=lambda job: ":" not in job)  # an array behind its children
-        runs = [look.run for look in unchanged if look.run not in stay and (look.decision.run or look.facts is None)]
+        runs = [plan.run for plan in unchanged if plan.run not in stay and (plan.decision.run or plan.facts is None)]
         for start in range(0, len(going), A_TRANSACTION):
             with self._writing, self._database.session() as session:
                 gone |= rows.forget_jobs(session, going[start : start + A_TRANSACTION])
@@ -337,34 +328,34 @@ class Retention:
         return gone, stay
 
     def _directories(
-        self, looks: Sequence[RetentionStep], unchanged: list[RetentionStep], stay: dict[str, str]
+        self, plans: Sequence[RetentionPlan], unchanged: list[RetentionPlan], stay: dict[str, str]
     ) -> Iterator[Path]:
         """The directories that go. Each run is read again right before: since it was looked at, another controller may have begun an
         attempt of it, which no lock of this one keeps out.
         """
-        for look in looks:
-            if not look.decision.jobs:
+        for plan in plans:
+            if not plan.decision.jobs:
                 continue
-            if self.stored.is_unchanged(look.run, look.facts):
-                unchanged.append(look)
-                yield from look.directories
+            if self.stored.is_unchanged(plan.run, plan.facts):
+                unchanged.append(plan)
+                yield from plan.directories
             else:
-                stay[look.run] = "it has just changed"
+                stay[plan.run] = "it has just changed"
 
     def _remove(self, thrown: Sequence[Path]) -> None:
         """Remove what was thrown away, several at once: each waits for the file system's journal."""
         wait([self._removing.submit(partial(trash.remove, path)) for path in thrown])
 
-    # -- one run, as a person asks --------------------------------------------------------------------------------------
+    # -- one run, as a person requests --------------------------------------------------------------------------------------
 
-    def _needs(self, name: str, whose: Whose) -> tuple[RunFacts | None, list[str]]:
+    def _needs(self, name: str, by: Requester) -> tuple[RunFacts | None, list[str]]:
         """A run as the store has it, and why it may not be deleted, in words for who asks. Raises Unavailable, OSError."""
         stored, facts = self.stored.references(0.0), self.stored.facts([name])[name]
         rules, moment = self.rules(), self._moment()
         with self._database.session() as session:
             jobs = rows.jobs_of_runs(session, [name], rules, moment)[name]
             needed = References.of(rows.references(session, [name])) | stored
-        needed = needed if whose.queues is None else needed.unnamed()
+        needed = needed if by.queues is None else needed.unnamed()
         return facts, [] if facts is None else still_needed(facts, jobs, needed)
 
     def open_job(self, name: str) -> str | None:
@@ -374,7 +365,7 @@ class Retention:
             query = select(Job.id).where(or_(Job.run == name, Job.id.in_(using)), Job.status.not_in(TERMINAL))
             return session.scalars(query.limit(1)).first()
 
-    def delete(self, name: str, whose: Whose = CONTROLLER) -> dict[str, Any]:
+    def delete(self, name: str, by: Requester = CONTROLLER) -> dict[str, Any]:
         """Delete a run with all that it holds, for who asks; its jobs stay in the history.
 
         Returns:
@@ -385,7 +376,7 @@ class Retention:
             Unavailable, OSError: The store or the database can't be used.
         """
         with self.alone(name):
-            facts, reasons = self._needs(name, whose)
+            facts, reasons = self._needs(name, by)
             if reasons:
                 raise RunNeeded(f"run {name} is kept: {'; '.join(reasons)}")
             path = self._store.run(name).path

@@ -231,7 +231,9 @@ class Errands:
 
     def trouble(self, key: Key) -> str:
         """That the store does not answer, or could not be used for the attempt the last time; empty where neither is so."""
-        return self._silence(key) or self._failing.failure(key) or ""
+        if key in self._under_way and (since := self._under_way[key][2]).passed >= OVERDUE:
+            return f"store {self._store} has not answered since {since}"
+        return self._failing.failure(key) or ""
 
     def delayed(self, key: Key) -> Delayed | None:
         """:meth:`trouble` as an event; None where there is none."""
@@ -243,12 +245,6 @@ class Errands:
             return self._failing.pause(key)
         left = OVERDUE - self._under_way[key][2].passed
         return left if left > 0 else inf
-
-    def _silence(self, key: Key) -> str:
-        """That the store does not answer, and since when; empty while it does, or is not overdue."""
-        if key not in self._under_way or (since := self._under_way[key][2]).passed < OVERDUE:
-            return ""
-        return f"store {self._store} has not answered since {since}"
 
     def forget(self, key: Key, run: str, release: Callable[[int], None], epoch: int | None) -> None:
         """The attempt on a run is closed.

@@ -51,15 +51,14 @@ def take_snapshot(
     """Read everything that the pass depends on.
 
     Args:
-        session: The session.
-        clock: Tells what time it is.
+        session, clock: The database, and steady time.
         capacities: All that the engines have, by their names.
         waiting: The jobs that wait for room.
         holding: The jobs whose gang holds some, with that attempt.
         leading: The job that the last pass found at the head of each queue.
         turns: As the last pass has left them.
         first: The controller's first engine.
-        unknown: Why an engine has not told what it has, by name; asked for before ``capacities``, which count.
+        unknown: Why an engine has not reported what it has, by name; read before ``capacities``, which count.
     """
     unknown = {name: why for name, why in (unknown or {}).items() if name not in capacities}
     anew = {"populate_existing": True}  # a session of the loop may have rows that requests have changed since
@@ -144,7 +143,7 @@ def _fair_share(document: Mapping[str, Any]) -> FairShare:
 def read_compute_environment(
     row: batch_models.ComputeEnvironment, first: str, unknown: Mapping[str, str] | None = None
 ) -> ComputeEnvironment:
-    """``first``: the engine of one that names none. ``unknown``: why an engine has not told what it has, by the names of those."""
+    """``first``: the engine of one that names none. ``unknown``: why an engine has not reported what it has, by the names of those."""
     named = row.tags.get(HOSTS_TAG)
     hosts = tuple(name.strip() for name in named.split(",")) if named else None
     most = (row.document.get("computeResources") or {}).get("maxvCpus")
@@ -164,7 +163,7 @@ def new_nodes(placements: Sequence[Placement]) -> list[Node]:
 def _running(job: Job, attempt: Attempt) -> RunningGang:
     try:
         options = job.gang.options
-    except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+    except Exception:  # a damaged row, which is reported when the job is settled
         options = NativeOptions()
     return RunningGang(
         job=job.id,

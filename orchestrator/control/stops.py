@@ -27,19 +27,19 @@ _AGAIN, _RARELY = 2.0, 30.0
 
 @dataclass(frozen=True)
 class _Stop:
-    """A stop that was asked for."""
+    """A stop that was requested."""
 
     engine: str
     waited: bool
     """Whether all threads for the engine were busy."""
-    asked: float
-    """When it was asked for (monotonic [s])."""
+    requested: float
+    """When it was requested (monotonic [s])."""
     result: Future[GangStatus]
 
     @property
-    def unsaid(self) -> float:
+    def unreported(self) -> float:
         """Seconds until its job says that it waits, or has waited; 0 from then on."""
-        return max(0.0, self.asked + _QUIET - machine.monotonic()) if self.waited else inf
+        return max(0.0, self.requested + _QUIET - machine.monotonic()) if self.waited else inf
 
 
 class Stops:
@@ -90,7 +90,7 @@ class Stops:
         if failure := self._denied.failure(key):
             return failure
         stop = self._under_way.get(key)
-        if stop is None or stop.unsaid:
+        if stop is None or stop.unreported:
             return None
         if not (stop.result.running() or stop.result.done()):
             return f"attempt {key[1]} waits for its turn to be stopped: the {stop.engine} engine is stopping {_THREADS} others"
@@ -105,7 +105,7 @@ class Stops:
         if key in self._stopped:
             return inf
         if (stop := self._under_way.get(key)) is not None:
-            return stop.unsaid or inf
+            return stop.unreported or inf
         return self._denied.pause(key)
 
     def forget(self, key: Key) -> None:
@@ -121,9 +121,9 @@ class Stops:
             self._pools[engine] = machine.pool(f"stop {engine}", _THREADS)
         waits = self._busy[engine] >= _THREADS
         self._busy[engine] += 1
-        asked = machine.monotonic()
-        result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, asked if waits else inf))
-        self._under_way[key] = _Stop(engine, waits, asked, result)
+        requested = machine.monotonic()
+        result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, requested if waits else inf))
+        self._under_way[key] = _Stop(engine, waits, requested, result)
         result.add_done_callback(lambda _: self._changed(key[0]))
 
     def _take(self, key: Key) -> _Stop:

@@ -35,7 +35,7 @@ class StoreAccess:
 
     def problem(self) -> str | None:
         """Why the store can't be read; None where it can, as far as was seen."""
-        return self.disk.away("store")
+        return self.disk.unavailable("store")
 
     def check(self) -> None:
         """Raises StoreSilent where what is at the store's path now is not the store: what is missing there may be missing for that."""

@@ -17,7 +17,7 @@ from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
 
 INTERVAL = 2.0
-"""Seconds between two looks."""
+"""Seconds between two runs."""
 
 
 class Upkeep:
@@ -34,7 +34,7 @@ class Upkeep:
     ) -> None:
         self._database, self._writes, self._access = database, writes, access
         self._texts, self._retention, self._monitoring = texts, retention, monitoring
-        self._looked = 0.0
+        self._ran = 0.0
         self._is_draining = True
         """Whether a deleted queue may still be there."""
 
@@ -43,12 +43,12 @@ class Upkeep:
         self._is_draining = True
         ask_to_end(session, Job.queue == queue.name, f"job queue {queue.name} was deleted")
 
-    def look(self) -> None:
+    def run(self) -> None:
         """Clear away what is due."""
-        if machine.monotonic() - self._looked < INTERVAL or not self._writes.lock.acquire(blocking=False):
+        if machine.monotonic() - self._ran < INTERVAL or not self._writes.lock.acquire(blocking=False):
             return  # somebody writes: gangs must not wait for that
         try:
-            self._looked = machine.monotonic()
+            self._ran = machine.monotonic()
             self._delete_queues()
             self._texts.sweep_when_due(self._access.calls.later)
             self._retention.when_due(self._access.calls.later)
@@ -56,26 +56,17 @@ class Upkeep:
             self._writes.lock.release()
 
     def _delete_queues(self) -> None:
+        """Delete the queues that are to go and have no open job."""
         if not self._is_draining:
             return
-        left, deleted = True, list[str]()
-        try:
-            with self._database.session() as session:
-                left, deleted = _delete_drained(session)
-        finally:
-            self._is_draining = left
-        for queue in deleted:
-            self._monitoring.forget_queue(queue)
-
-
-def _delete_drained(session: Session) -> tuple[bool, list[str]]:
-    """Delete the queues that are to go and have no open job; returns whether others are left, and the names of those deleted."""
-    left, deleted = False, list[str]()
-    for queue in session.scalars(select(JobQueue).where(JobQueue.deleting)):
-        busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
-        if session.scalars(busy).first() is None:
-            session.delete(queue)
-            deleted.append(queue.name)
-        else:
-            left = True
-    return left, deleted
+        deleted = list[str]()
+        with self._database.session() as session:
+            queues = session.scalars(select(JobQueue).where(JobQueue.deleting)).all()
+            for queue in queues:
+                busy = select(Job.id).where(Job.queue == queue.name, Job.status.not_in(TERMINAL)).limit(1)
+                if session.scalars(busy).first() is None:
+                    session.delete(queue)
+                    deleted.append(queue.name)
+        self._is_draining = len(deleted) < len(queues)
+        for name in deleted:
+            self._monitoring.forget_queue(name)

@@ -7,11 +7,11 @@ controller connect to what only the controller can reach. The database keeps the
 from __future__ import annotations
 
 import base64
-import binascii
 import hashlib
 import hmac
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal
 from urllib.parse import urlsplit
@@ -37,29 +37,24 @@ class WebhooksError(Exception):
 
 
 def _url(value: str) -> str:
-    try:
+    with suppress(ValueError):
         parts = urlsplit(value)
-        is_one = parts.scheme in ("http", "https") and bool(parts.hostname) and parts.port != 0
-    except ValueError:
-        is_one = False
-    if not is_one:
-        raise ValueError("expected a URL such as https://chat.example/hooks/muster")
-    return value
+        if parts.scheme in ("http", "https") and parts.hostname and parts.port != 0:
+            return value
+    raise ValueError("expected a URL such as https://chat.example/hooks/muster")
 
 
 def _secret(value: str) -> str:
-    try:
-        size = len(_bytes(value))
-    except (ValueError, binascii.Error):
-        size = 0
-    if not value.startswith(_PREFIX) or size not in _SECRET_SIZES:
-        raise ValueError(
-            "expected whsec_ and 24 to 64 random bytes in base64; make one: echo whsec_$(openssl rand -base64 32)"
-        )
-    return value
+    with suppress(ValueError):
+        if value.startswith(_PREFIX) and len(_bytes(value)) in _SECRET_SIZES:
+            return value
+    raise ValueError(
+        "expected whsec_ and 24 to 64 random bytes in base64; make one: echo whsec_$(openssl rand -base64 32)"
+    )
 
 
 def _bytes(secret: str) -> bytes:
+    """Raises ValueError."""
     return base64.b64decode(secret.removeprefix(_PREFIX), validate=True)
 
 
@@ -69,19 +64,22 @@ def _kind(value: str) -> str:
     return value
 
 
+Url = Annotated[str, AfterValidator(_url)]
+
+
 class Webhook(BaseModel):
     """One receiver."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, hide_input_in_errors=True)
     name: str = ""
-    url: Annotated[str, AfterValidator(_url)]
+    url: Url
     secret: Annotated[str, AfterValidator(_secret)] = Field(repr=False)
     statuses: list[Literal["SUCCEEDED", "FAILED"]] = Field(default=["SUCCEEDED", "FAILED"], min_length=1)
     queues: list[str] | None = None
     """Names of job queues; None: all."""
     kinds: list[Annotated[str, AfterValidator(_kind)]] | None = None
     """Of :data:`orchestrator.spec.model.KINDS`; None: all."""
-    link: Annotated[str, AfterValidator(_url)] | None = None
+    link: Url | None = None
     """URL at which the receiver's people reach this controller; None: the address at which it listens."""
 
     @property
@@ -91,7 +89,7 @@ class Webhook(BaseModel):
         return f"{parts.scheme}://{parts.hostname}" + (f":{parts.port}" if parts.port else "")
 
     def wants(self, job: Job) -> bool:
-        """Whether it is told of the end of this job; of an array as a whole, not of its children."""
+        """Whether it gets a message about the end of this job; of an array as a whole, not of its children."""
         if job.parent is not None or job.status not in self.statuses:
             return False
         if self.queues is not None and job.queue not in self.queues:
@@ -143,14 +141,14 @@ def read_webhooks(source: str) -> Sequence[Webhook]:
     return _webhooks(found, str(path))
 
 
-def settle_webhooks(own: OwnSecrets, given: Sequence[Webhook] | None) -> Sequence[Webhook]:
-    """The webhooks from now on: those that are ``given``, which replace the database's; where None, the database's.
+def settle_webhooks(own: OwnSecrets, new: Sequence[Webhook] | None) -> Sequence[Webhook]:
+    """The webhooks from now on: the ``new`` ones, which replace the database's; where None, the database's.
 
     Raises WebhooksError, SealError, DatabaseError.
     """
-    if given is not None:
-        own[WEBHOOKS] = json.dumps({each.name: each.model_dump(mode="json", exclude={"name"}) for each in given})
-        return given
+    if new is not None:
+        own[WEBHOOKS] = json.dumps({each.name: each.model_dump(mode="json", exclude={"name"}) for each in new})
+        return new
     kept = own.get(WEBHOOKS)
     return (
         _webhooks(json.loads(kept), "the database's webhooks (muster serve --webhooks FILE replaces them)")
@@ -165,13 +163,15 @@ def _webhooks(found: Any, where: str) -> Sequence[Webhook]:
         raise WebhooksError(f'{where}: expected a JSON object, {{"NAME": {{"url": "https://…", "secret": "whsec_…"}}}}')
     for name in found:
         if not NAME.fullmatch(name) or "name" in (found[name] if isinstance(found[name], dict) else {}):
-            raise WebhooksError(f"{where}: {name[:60]!r} is no name of a webhook: letters, digits, '.', '_' and '-'")
+            raise WebhooksError(
+                f"{where}: {name[:60]!r} is not a name for a webhook: expected letters, digits, '.', '_' and '-'"
+            )
     try:
         read = TypeAdapter(dict[str, Webhook]).validate_python(found)
     except ValidationError as error:
         first: Any = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in path_of(first))
-        words = f"unknown key; valid here: {', '.join(_KEYS)}" if first["type"] == "extra_forbidden" else _told(first)
+        words = f"unknown key; valid here: {', '.join(_KEYS)}" if first["type"] == "extra_forbidden" else _words(first)
         raise WebhooksError(f"{where}: {key}: {words}") from None
     return [webhook.model_copy(update={"name": name}) for name, webhook in read.items()]
 
@@ -179,7 +179,7 @@ def _webhooks(found: Any, where: str) -> Sequence[Webhook]:
 _KEYS = [name for name in Webhook.model_fields if name != "name"]
 
 
-def _told(problem: Any) -> str:
+def _words(problem: Any) -> str:
     """The problem of a value, without the value where that is a secret, or a URL that may hold one."""
     if problem["type"] == "value_error":
         return str(problem["ctx"]["error"])

@@ -1,6 +1,6 @@
-"""The controller's work queue, in memory: jobs that wait for resources, those with a gang, and those due for a look.
+"""The controller's work queue, in memory: jobs that wait for resources, those with a gang, and those to be settled.
 
-It follows every commit, and is read anew from the database at a start, so that 100,000 waiting jobs cost no query a look.
+It follows every commit, and is read anew from the database at a start, so that 100,000 waiting jobs cost no query a pass.
 """
 
 from __future__ import annotations
@@ -29,12 +29,22 @@ class WorkQueue:
         self._lock = threading.Lock()
         self._waiting: dict[str, Waiting] = {}
         self._active: dict[str, float] = {}
-        """When each is looked at next (monotonic [s]); infinity while it is being looked at."""
+        """When each is observed next (monotonic [s]); infinity while it is being observed."""
         self._due: dict[str, None] = {}
         self._ended: dict[str, None] = {}
         self._shapes: dict[Shape, Shape] = {}
         self.version = 0
         """Grows whenever something changes that a scheduling pass depends on."""
+        self.alarm = threading.Event()
+        """Set by whatever changes something: the controller's loop then makes a pass at once."""
+
+    def gang_changed(self, gang: str) -> None:
+        """A gang has changed, by its name or that of its job; empty: what an engine has."""
+        if gang:
+            self.hurry(gang.partition("/")[0])
+        else:
+            self.version += 1  # a pass depends on it
+        self.alarm.set()
 
     def load(self, session: Session) -> None:
         """Read all jobs that are not over, and forget the earlier state. PENDING jobs become due: one on which they depend may have ended."""
@@ -57,27 +67,27 @@ class WorkQueue:
 
     def _note(self, job: Job) -> None:
         job_id, status = job.id, Status(job.status)
-        waited, next_look = self._waiting.pop(job_id, None), self._active.pop(job_id, None)
-        # not out of _due: whoever asked for another look may know of a change that came after this one was read
+        waited, due_at = self._waiting.pop(job_id, None), self._active.pop(job_id, None)
+        # not out of _due: whoever asked again may know of a change that came after this one was read
         if status.is_terminal:
             self._ended[job_id] = None
             if job.parent is not None:
                 self._due[job.parent] = None
         elif status in (Status.STARTING, Status.RUNNING):
-            self._active[job_id] = next_look or 0.0
+            self._active[job_id] = due_at or 0.0
         elif status is Status.RUNNABLE and job.stop_reason is None:
             try:
                 self._waiting[job_id] = self._entry(job)
-            except Exception:  # a damaged row, whose trouble is found, and said, by the look at the job
+            except Exception:  # a damaged row, which is reported when the job is settled
                 self._due[job_id] = None
         elif status is Status.SUBMITTED or job.stop_reason is not None:
             self._due[job_id] = None
-        # a PENDING job is looked at when one that it waits for, or a child of it, has ended
-        if (waited is None, next_look is None) != (job_id not in self._waiting, job_id not in self._active):
+        # a PENDING job is settled when one that it waits for, or a child of it, has ended
+        if (waited is None, due_at is None) != (job_id not in self._waiting, job_id not in self._active):
             self.version += 1
 
     def take_due(self, most: int | None = None) -> Sequence[str]:
-        """The jobs to be looked at once, oldest note first, at most so many; each is returned once."""
+        """The jobs to be settled, oldest note first, at most so many; each is returned once."""
         with self._lock:
             due = list(islice(self._due, most))
             for job in due:
@@ -99,14 +109,14 @@ class WorkQueue:
                 self._active[job] = 0.0
 
     def take_active(self, moment: float) -> Sequence[str]:
-        """The jobs whose gang is to be looked at by now (monotonic [s]); each gets its next look by :meth:`later`."""
+        """The jobs whose gang is to be observed by now (monotonic [s]); each gets its next time by :meth:`later`."""
         with self._lock:
-            due = [job for job, look in self._active.items() if look <= moment]
+            due = [job for job, due_at in self._active.items() if due_at <= moment]
             self._active.update(dict.fromkeys(due, inf))
         return due
 
     def later(self, job: str, moment: float) -> None:
-        """Look at a gang next at this moment (monotonic [s]), unless something has changed since it was taken."""
+        """Observe a gang next at this moment (monotonic [s]), unless something has changed since it was taken."""
         with self._lock:
             if self._active.get(job) == inf:
                 self._active[job] = moment

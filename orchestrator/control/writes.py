@@ -1,21 +1,32 @@
-"""Writes to the database: one at a time, so that what was checked still holds at the commit, and refused while they can't be kept."""
+"""Writes to the database: one at a time, so that what was checked still holds at the commit, and refused while they can't be kept.
+
+A commit costs a trip to the disk, whatever it holds: submissions that arrive during one are written together by the next.
+"""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future
 from contextlib import contextmanager
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from sqlalchemy.exc import OperationalError
 from sqlalchemy.orm import Session
 
 from orchestrator.control.disk import Disk
 from orchestrator.control.isolation import Isolation
 from orchestrator.control.store_identity import StoreAbsent
-from orchestrator.persistence.group_commit import GroupCommit
+from orchestrator.domain.errors import RequestError
 from orchestrator.persistence.session import Database, DatabaseError, DatabaseFull
 
 T = TypeVar("T")
+_Call = tuple[Callable[[Session], Any], Future[Any]]
+
+
+class _OneIsToBlame(Exception):
+    """One of several calls broke the group."""
 
 
 class Writes:
@@ -25,7 +36,7 @@ class Writes:
         self._database, self._isolation, self._disk = database, isolation, disk
         self.lock = threading.Lock()
         """Held while something is registered, submitted or changed."""
-        self._gathered = GroupCommit(database, self.lock)
+        self._pending = deque[_Call]()
 
     def check(self, *, adds: bool) -> None:
         """Whether a request may change the database, to which it ``adds`` something or not.
@@ -49,5 +60,42 @@ class Writes:
             yield session
 
     def gather(self, body: Callable[[Session], T]) -> T:
-        """The result of ``body``, which adds to its session, once that is committed, maybe with others'. Raises what ``body`` raises."""
-        return self._gathered.call(body)
+        """The result of ``body`` once it is committed, maybe with others'. Raises RequestError, or the database's error.
+
+        Args:
+            body: First looks, and raises RequestError where it refuses; then adds to the session.
+        """
+        future = Future[T]()
+        self._pending.append((body, future))
+        with self.lock:
+            if not future.done():  # else the one that had the lock before has committed it
+                self._commit([self._pending.popleft() for _ in range(len(self._pending))])
+        return future.result()
+
+    def _commit(self, calls: Sequence[_Call]) -> None:
+        results = list[Any]()
+        try:
+            with self._database.session() as session:
+                try:
+                    for body, _ in calls:
+                        try:
+                            results.append(body(session))
+                        except RequestError as error:  # it leaves nothing in the session and does not affect the others
+                            results.append(error)
+                    session.flush()
+                except Exception as error:
+                    if len(calls) == 1 or isinstance(error, OperationalError):
+                        raise
+                    raise _OneIsToBlame from error
+        except _OneIsToBlame:  # nothing was committed
+            for call in calls:
+                self._commit([call])
+            return
+        except Exception as error:  # of the commit too, after which the stored state is unknown
+            refused = [each if isinstance(each, RequestError) else error for each in results]
+            results = [*refused, *[error] * (len(calls) - len(refused))]
+        for (_, future), result in zip(calls, results, strict=True):
+            if isinstance(result, Exception):
+                future.set_exception(result)
+            else:
+                future.set_result(result)

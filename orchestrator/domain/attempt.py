@@ -10,39 +10,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from orchestrator.domain import attempt_instructions as do
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
     Event,
     Gone,
-    LaunchDelayed,
     Launched,
-    LaunchRefused,
     Observed,
     Preempted,
     Prepared,
-    PrepareDelayed,
-    PrepareRefused,
+    Refused,
     Silence,
-)
-from orchestrator.domain.attempt_instructions import (
-    AwaitCause,
-    AwaitChildren,
-    Close,
-    Decide,
-    Explain,
-    Instruction,
-    Instructions,
-    Keep,
-    Launch,
-    MarkRunning,
-    Observe,
-    Prepare,
-    Save,
-    Stop,
-    TakeEpoch,
-    WindUp,
-    Withdraw,
 )
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import (
@@ -55,15 +34,15 @@ from orchestrator.domain.job import (
     judge,
     judge_as_aws,
     lost_host,
+    retries,
 )
 from orchestrator.domain.native_options import NativeOptions
-from orchestrator.domain.retry import retries
 from shared_store.contract.error_text import counted
 
 UNHEARD = 10.0
 """Seconds of a node's silence from which its job says so."""
 CAUSE_PATIENCE = 90_000
-"""For so long [ms] a gang that has lost nodes which were told to end waits for the end of the node that is the cause."""
+"""For so long [ms] a gang that has lost nodes that were stopped waits for the end of the node that is the cause."""
 FINISHING = 10_000
 """Children of a native job get so long [ms] to end by themselves after the main node is done. On AWS the main node's end cuts them off; a
 rank that prints its last line or closes a file deserves better."""
@@ -146,7 +125,7 @@ class AttemptState:
     stop_reason: str | None = None
     """Set once the job was asked to end."""
     cause_since: int | None = None
-    """Since when only nodes have ended that were told to."""
+    """Since when only nodes have ended that were stopped."""
     done_since: int | None = None
     """Since when the main node is done and children still run."""
     closed: bool = False
@@ -164,100 +143,103 @@ class AttemptState:
         return AttemptPhase.RUNNING if self.started else AttemptPhase.STARTING
 
 
-def step(state: AttemptState, event: Event) -> Instructions:
+def step(state: AttemptState, event: Event) -> do.Instructions:
     """What is to be done, in this order. An event that means nothing in a state is passed over."""
     match state.phase, event:
         case AttemptPhase.CLOSED, _:
             return ()
         case AttemptPhase.PREPARING, Due() if state.verdict is not None:
-            return (WindUp(),)
+            return (do.WindUp(),)
         case AttemptPhase.PREPARING, Due() if state.stop_reason is not None:
-            return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
+            return do.Decide(Verdict(Ending.STOPPED, state.stop_reason)), do.WindUp()
         case AttemptPhase.PREPARING, Due():
-            return (Prepare(),)
+            return (do.Prepare(),)
         case AttemptPhase.PREPARING, Prepared(epoch):
-            return TakeEpoch(epoch), Save(), Launch()
-        case AttemptPhase.PREPARING, PrepareDelayed(reason):
-            return (Withdraw(reason),)
-        case AttemptPhase.PREPARING, PrepareRefused(reason):
-            return Decide(Verdict(Ending.FATAL, reason, start_error=reason)), WindUp()
+            return do.TakeEpoch(epoch), do.Save(), do.Launch()
+        case AttemptPhase.PREPARING, Delayed(reason, idle=True):
+            return (do.Withdraw(reason),)
+        case AttemptPhase.PREPARING, Refused(reason):
+            return do.Decide(Verdict(Ending.FATAL, reason, start_error=reason)), do.WindUp()
         case AttemptPhase.LAUNCHING, Due():
-            return (Launch(again=state.verdict is None and state.stop_reason is None),)
+            return (do.Launch(again=state.verdict is None and state.stop_reason is None),)
         case AttemptPhase.LAUNCHING, Launched(handle):
-            return Keep(handle), Save(), Observe()
-        case AttemptPhase.LAUNCHING, LaunchDelayed(unknown=False) if state.verdict is not None:
-            return (WindUp(),)
-        case AttemptPhase.LAUNCHING, LaunchDelayed(unknown=False) if state.stop_reason is not None:
-            return Decide(Verdict(Ending.STOPPED, state.stop_reason)), WindUp()
-        case AttemptPhase.LAUNCHING, LaunchDelayed(reason) if reason:
-            return (Explain(reason),)
-        case AttemptPhase.LAUNCHING, LaunchRefused() if state.verdict is not None:
-            return (WindUp(),)
-        case AttemptPhase.LAUNCHING, LaunchRefused():
-            return Decide(_refused(state.terms, event)), WindUp()
+            return do.Keep(handle), do.Save(), do.Observe()
+        case AttemptPhase.LAUNCHING, Delayed(idle=True) | Refused() if state.verdict is not None:
+            return (do.WindUp(),)
+        case AttemptPhase.LAUNCHING, Delayed(idle=True) if state.stop_reason is not None:
+            return do.Decide(Verdict(Ending.STOPPED, state.stop_reason)), do.WindUp()
+        case AttemptPhase.LAUNCHING, Refused():
+            return do.Decide(_refused(state.terms, event)), do.WindUp()
         case _, Preempted(reason) if state.verdict is None:
-            return (Decide(Verdict(Ending.PREEMPTED, reason)),)
+            return (do.Decide(Verdict(Ending.PREEMPTED, reason)),)
         case AttemptPhase.STARTING | AttemptPhase.RUNNING | AttemptPhase.ENDING, Due():
-            return (Observe(),)
+            return (do.Observe(),)
         case AttemptPhase.STARTING | AttemptPhase.RUNNING | AttemptPhase.ENDING, Observed():
             return _observed(state, event)
-        case _, Delayed(reason):
-            return (Explain(reason),)
+        case _, Delayed(reason) if reason:
+            return (do.Explain(reason),)
         case _, Gone() if state.verdict is not None:
             return (_close(state, state.verdict, event),)
     return ()
 
 
-def _refused(terms: Terms, event: LaunchRefused) -> Verdict:
+def _refused(terms: Terms, event: Refused) -> Verdict:
     ending = Ending.FATAL if event.is_final else Ending.FAILED
     reason = f"{NOT_STARTED}{event.reason}" if event.is_final else event.reason
     return Verdict(ending, reason if terms.options.is_native else AWS_NOT_STARTED, start_error=event.reason)
 
 
-def _observed(state: AttemptState, seen: Observed) -> Instructions:
-    """The tables for a look, one after the other, each from the state that the one before leaves."""
-    was_decided, done = state.verdict is not None, Instructions()
-    for table in (_tell, _judge):
+def _observed(state: AttemptState, seen: Observed) -> do.Instructions:
+    """The tables for an observation, one after the other, each from the state that the one before leaves."""
+    was_decided, done = state.verdict is not None, do.Instructions()
+    for table in (_explain, _judge):
         for instruction in table(state, seen):
             state, done = after(state, instruction), (*done, instruction)
     return *done, *_end(state, seen, is_explained=was_decided and not done)
 
 
-def _tell(state: AttemptState, seen: Observed) -> Instructions:
+def _explain(state: AttemptState, seen: Observed) -> do.Instructions:
     """The reason that the job's user sees."""
     unheard = _unheard(state.terms, seen)
     if seen.unread is not None:
         reason = "; ".join(each for each in (seen.waits, unheard, seen.stale, seen.unread) if each)
-        return (Explain(reason),) if reason != unheard and state.verdict is None else ()
+        return (do.Explain(reason),) if reason != unheard and state.verdict is None else ()
     runs = seen.words or f"attempt {state.terms.number} runs on {state.terms.size}"
     runs = "; ".join(each for each in (runs, unheard, seen.stale) if each)
     if seen.waits:
-        return (Explain(seen.waits),) if state.verdict is None else ()
+        return (do.Explain(seen.waits),) if state.verdict is None else ()
     if not state.started:
-        return (MarkRunning(runs, seen.moment),)
-    return (Explain(runs),) if state.verdict is None else ()
+        return (do.MarkRunning(runs, seen.moment),)
+    return (do.Explain(runs),) if state.verdict is None else ()
 
 
-def _judge(state: AttemptState, seen: Observed) -> Instructions:
+def _judge(state: AttemptState, seen: Observed) -> do.Instructions:
     """Whether the attempt is to end, and how: by the nodes' ends once they are known, on request, for its silence, or for its time."""
     if state.verdict is not None:
         return ()
-    waits: Instructions = ()
-    verdict = _by_ends(state.terms, seen.ends) if seen.unread is None else None
+    waits: do.Instructions = ()
+    terms, verdict = state.terms, None
+    if seen.unread is None and terms.options.is_native:
+        verdict = judge(terms.options.on_child_failure, terms.main, seen.ends)
+    elif seen.unread is None:
+        verdict = judge_as_aws(terms.main, seen.ends, terms.hosts[terms.main])
     if verdict is not None and not verdict.certain:
         since = seen.moment if state.cause_since is None else state.cause_since
         if seen.moment - since <= CAUSE_PATIENCE:
-            verdict, waits = None, (AwaitCause(since),)
+            verdict, waits = None, (do.Await("cause_since", since),)
     if verdict is None and state.stop_reason is not None:
         verdict = Verdict(Ending.STOPPED, state.stop_reason)
-    verdict = verdict or _by_silence(state.terms, seen) or _by_time(state, seen.moment)
-    return waits if verdict is None else (*waits, Decide(verdict))
+    verdict = verdict or _by_silence(terms, seen)
+    ran = seen.moment - (state.running_since or seen.moment)
+    if verdict is None and terms.timeout and ran > terms.timeout * 1000:
+        verdict = Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
+    return waits if verdict is None else (*waits, do.Decide(verdict))
 
 
-def _end(state: AttemptState, seen: Observed, *, is_explained: bool) -> Instructions:
+def _end(state: AttemptState, seen: Observed, *, is_explained: bool) -> do.Instructions:
     """Once the end is decided: the gang is stopped, unless its children may end by themselves.
 
-    ``is_explained``: an earlier look has said why the job ends; the stop may have something to add, which stays.
+    ``is_explained``: an earlier observation has explained why the job ends; the stop may have something to add, which stays.
     """
     if (verdict := state.verdict) is None:
         return ()
@@ -265,16 +247,10 @@ def _end(state: AttemptState, seen: Observed, *, is_explained: bool) -> Instruct
     if verdict.ending == Ending.SUCCEEDED and state.terms.options.is_native and None in seen.ends:
         since = seen.moment if state.done_since is None else state.done_since
         if seen.moment - since < FINISHING:
-            return Explain(waits), Save(), AwaitChildren(since)
+            return do.Explain(waits), do.Save(), do.Await("done_since", since)
     grace = _FAILED_GRACE if verdict.ending in (Ending.FAILED, Ending.FATAL) else state.terms.grace + _MARGIN
-    recorded = (Save(),) if is_explained else (Explain(waits), Save())
-    return *recorded, Stop(grace, waits)
-
-
-def _by_ends(terms: Terms, ends: Sequence[NodeEnd | None]) -> Verdict | None:
-    if terms.options.is_native:
-        return judge(terms.options.on_child_failure, terms.main, ends)
-    return judge_as_aws(terms.main, ends, terms.hosts[terms.main])
+    recorded = (do.Save(),) if is_explained else (do.Explain(waits), do.Save())
+    return *recorded, do.Stop(grace, waits)
 
 
 def _by_silence(terms: Terms, seen: Observed) -> Verdict | None:
@@ -304,14 +280,7 @@ def _unheard(terms: Terms, seen: Observed) -> str:
     return ""
 
 
-def _by_time(state: AttemptState, moment: int) -> Verdict | None:
-    timeout, since = state.terms.timeout, state.running_since
-    if timeout and since and moment - since > timeout * 1000:
-        return Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
-    return None
-
-
-def _close(state: AttemptState, verdict: Verdict, gone: Gone) -> Close:
+def _close(state: AttemptState, verdict: Verdict, gone: Gone) -> do.Close:
     """What becomes of the job: over, or RUNNABLE again."""
     terms, ending, progress = state.terms, verdict.ending, gone.progress
     native, number = terms.options.is_native, terms.number
@@ -321,8 +290,8 @@ def _close(state: AttemptState, verdict: Verdict, gone: Gone) -> Close:
     is_left = spent < terms.allowed
     head = gone.ends[terms.main] if terms.main < len(gone.ends) else None
 
-    def to(status: Status, reason: str) -> Close:
-        return Close(gone.moment, not is_free, status, reason)
+    def to(status: Status, reason: str) -> do.Close:
+        return do.Close(gone.moment, not is_free, status, reason)
 
     match ending:
         case Ending.STOPPED if _was_done(ending, native, head):
@@ -351,16 +320,16 @@ def _close(state: AttemptState, verdict: Verdict, gone: Gone) -> Close:
     return to(Status.FAILED, verdict.reason)
 
 
-def _cancelled(terms: Terms, gone: Gone, *, spent: bool, may_go_on: bool) -> Close:
+def _cancelled(terms: Terms, gone: Gone, *, spent: bool, may_go_on: bool) -> do.Close:
     """Whoever cancels a gang in its engine's queue again and again does not want it there."""
     times, most = terms.cancelled + 1, gone.cancellations
     how = f"attempt {terms.number} was {gone.cancelled}{gone.progress}"
     if may_go_on and times <= most:
-        return Close(
+        return do.Close(
             gone.moment, spent, Status.RUNNABLE, f"{how}; starting again ({times} of {most} times)", gone.cancelled
         )
     reason = f"{how}; not started again after {counted(times, 'cancellation')}: ask who did it before you resume it"
-    return Close(gone.moment, spent, Status.FAILED, reason, gone.cancelled)
+    return do.Close(gone.moment, spent, Status.FAILED, reason, gone.cancelled)
 
 
 def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:
@@ -384,21 +353,21 @@ def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:
     return retries(terms.conditions, verdict.exit_code, reason, verdict.reason)
 
 
-def after(state: AttemptState, instruction: Instruction) -> AttemptState:
+def after(state: AttemptState, instruction: do.Instruction) -> AttemptState:
     """The state once an instruction was carried out."""
     match instruction:
-        case TakeEpoch():
+        case do.TakeEpoch():
             return replace(state, prepared=True)
-        case Keep():
+        case do.Keep():
             return replace(state, launched=True)
-        case MarkRunning(_, moment):
+        case do.MarkRunning(_, moment):
             return replace(state, started=True, running_since=moment)
-        case AwaitCause(since):
-            return replace(state, cause_since=since)
-        case AwaitChildren(since):
-            return replace(state, done_since=since)
-        case Decide(verdict):
+        case do.Await("cause_since", moment):
+            return replace(state, cause_since=moment)
+        case do.Await(_, moment):
+            return replace(state, done_since=moment)
+        case do.Decide(verdict):
             return replace(state, verdict=verdict)
-        case Close():
+        case do.Close():
             return replace(state, closed=True)
     return state

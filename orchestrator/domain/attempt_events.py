@@ -23,7 +23,7 @@ class Silence:
 
 @dataclass(frozen=True)
 class Due:
-    """It is time for a look at the attempt."""
+    """It is time to go on with the attempt."""
 
 
 @dataclass(frozen=True)
@@ -34,34 +34,17 @@ class Prepared:
 
 
 @dataclass(frozen=True)
-class PrepareRefused:
-    """The run can't be used for good."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
 class Launched:
     handle: str
 
 
 @dataclass(frozen=True)
-class LaunchDelayed:
-    """The launch has to wait."""
-
-    reason: str
-    """Empty where there is nothing to say yet."""
-    unknown: bool
-    """Whether something of the gang may run already."""
-
-
-@dataclass(frozen=True)
-class LaunchRefused:
-    """The engine does not start the gang."""
+class Refused:
+    """The run can't be used, or the engine does not start the gang."""
 
     reason: str
     is_final: bool = True
-    """It refuses the gang for good; else this attempt has failed, and another one may start."""
+    """Whether that stays so; else this attempt has failed, and another one may start."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +56,7 @@ class Preempted:
 
 @dataclass(frozen=True)
 class Observed:
-    """A look at the gang."""
+    """The gang was observed."""
 
     moment: int
     """Steady time [ms]."""
@@ -88,21 +71,17 @@ class Observed:
     words: str = ""
     """What the engine says of a main node that runs."""
     stale: str = ""
-    """Why this is an older picture, where it is."""
-
-
-@dataclass(frozen=True)
-class PrepareDelayed:
-    """The run can't be taken now, and nothing that was asked of the store is under way."""
-
-    reason: str
+    """Why this is an older status; empty where it is current."""
 
 
 @dataclass(frozen=True)
 class Delayed:
-    """The store can't be used now or does not answer, or the gang can't be stopped; that is tried again, or waited for."""
+    """What was asked of the store or the engine has to wait: it does not answer, or can't do it now; that is tried again."""
 
     reason: str
+    """Empty where there is nothing to say yet."""
+    idle: bool = False
+    """Whether nothing that was asked for is under way, so that the attempt may be taken back or end."""
 
 
 @dataclass(frozen=True)
@@ -121,16 +100,4 @@ class Gone:
     """How often the job is started again after that."""
 
 
-Event = (
-    Due
-    | Prepared
-    | PrepareDelayed
-    | PrepareRefused
-    | Launched
-    | LaunchDelayed
-    | LaunchRefused
-    | Preempted
-    | Observed
-    | Delayed
-    | Gone
-)
+Event = Due | Prepared | Launched | Refused | Delayed | Preempted | Observed | Gone

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from orchestrator.domain.job import Status, Verdict
 
 
 @dataclass(frozen=True)
 class Prepare:
-    """Create the run where it is missing, and give it to the attempt: → Prepared, PrepareDelayed or PrepareRefused; Delayed or nothing yet."""
+    """Create the run where it is missing, and give it to the attempt: → Prepared, Delayed or Refused, or nothing yet."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,7 @@ class Withdraw:
 
 @dataclass(frozen=True)
 class Launch:
-    """Ask the engine to launch the gang, which it does once for an epoch: → Launched, LaunchDelayed or LaunchRefused."""
+    """Ask the engine to launch the gang, which it does once for an epoch: → Launched, Delayed or Refused."""
 
     again: bool = True
     """Whether to try again where nothing of the gang can run yet."""
@@ -43,7 +44,7 @@ class Keep:
 
 @dataclass(frozen=True)
 class Observe:
-    """Look at the gang: → Observed or Delayed, or nothing before the engine's first look."""
+    """Observe the gang: → Observed or Delayed, or nothing before the engine's first poll."""
 
 
 @dataclass(frozen=True)
@@ -62,17 +63,12 @@ class MarkRunning:
 
 
 @dataclass(frozen=True)
-class AwaitCause:
-    """Wait for the node that was the cause, since this moment (steady time [ms])."""
+class Await:
+    """Wait for other nodes since this moment (steady time [ms]): for the one that was the cause, or for children of a main node that is done."""
 
-    since: int
-
-
-@dataclass(frozen=True)
-class AwaitChildren:
-    """Wait for the children of a main node that is done, since this moment (steady time [ms])."""
-
-    since: int
+    what: Literal["cause_since", "done_since"]
+    """Where :class:`orchestrator.domain.attempt.AttemptState` has the moment."""
+    moment: int
 
 
 @dataclass(frozen=True)
@@ -124,8 +120,7 @@ Instruction = (
     | Observe
     | Explain
     | MarkRunning
-    | AwaitCause
-    | AwaitChildren
+    | Await
     | Decide
     | Save
     | Stop

@@ -21,8 +21,8 @@ class Host:
     """MiB."""
     single: bool = False
     """Whether it takes one node of a gang at most."""
-    away: bool = False
-    """Whether it takes no node now but may later. An engine that queues is still given a gang that needs it, and waits."""
+    unavailable: bool = False
+    """Whether it takes no node now but may later. An engine that queues still gets a gang that needs it, and waits."""
     machine: str = ""
     """Shared by the hosts of several engines that are one machine: capacity allocated on one is unavailable on the others. Empty: the
     machine is this host's alone."""

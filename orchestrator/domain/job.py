@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -34,7 +34,7 @@ TERMINAL = (Status.SUCCEEDED, Status.FAILED)
 """States of a job that has ended."""
 
 EARLY = (Status.SUBMITTED, Status.PENDING, Status.RUNNABLE)
-"""States of a job that has not begun to start: CancelJob ends no other."""
+"""States of a job that has not started to start: CancelJob ends no other."""
 
 TRANSITIONS = {
     Status.SUBMITTED: {Status.PENDING, Status.RUNNABLE, Status.FAILED},
@@ -91,11 +91,11 @@ class RunTime:
             attempts: Start and end of each (Unix time [ms]); no end: it runs.
             moment: The present (Unix time [ms]).
         """
-        begun = [(start, end) for start, end in attempts if start is not None]
-        if not begun:
+        started = [(start, end) for start, end in attempts if start is not None]
+        if not started:
             return None
-        passed = sum(max(0, (moment if end is None else end) - start) for start, end in begun)
-        runs = any(end is None for _, end in begun)
+        passed = sum(max(0, (moment if end is None else end) - start) for start, end in started)
+        runs = any(end is None for _, end in started)
         return cls(passed / 1000, moment - passed if runs else None)
 
 
@@ -111,7 +111,7 @@ class NodeEnd:
     lost: bool = False
     """The end was not observed: the node vanished, presumably with its host."""
     asked: bool | None = False
-    """The node was told to end: the cause lies elsewhere. None: that is not known."""
+    """The node was asked to end: the cause lies elsewhere. None: that is not known."""
     cannot_start: bool = False
     """Its program or its container could not be started."""
     fault: str | None = None
@@ -131,7 +131,7 @@ class Verdict:
     reason: str
     exit_code: int | None = None
     certain: bool = True
-    """False while every node that has ended was told to end: the cause may be observed later."""
+    """False while every node that has ended was asked to end: the cause may be observed later."""
     fault: str | None = None
     """As :attr:`NodeEnd.fault`, of the node that was the cause; native jobs only."""
     start_error: str | None = None
@@ -232,3 +232,28 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
     ending = Ending.FATAL if policy == "fail" and index != main else Ending.FAILED
     reason = f"{'main node' if index == main else f'node {index}'}: {first.reason}"
     return Verdict(ending, reason, first.exit_code, certain=not (first.asked and is_unseen), fault=first.fault)
+
+
+def retries(conditions: Sequence[Mapping[str, str]], exit_code: int | None, reason: str, status_reason: str) -> bool:
+    """``retryStrategy.evaluateOnExit``: whether the first matching condition says RETRY; True if none matches, as on AWS.
+
+    Args:
+        conditions: ``evaluateOnExit``; what one entry names must all match.
+        exit_code: Of the main node's container; None where it has none.
+        reason: Of the main node's container.
+        status_reason: Of the attempt.
+    """
+    seen = {
+        "onExitCode": "" if exit_code is None else str(exit_code),
+        "onReason": reason,
+        "onStatusReason": status_reason,
+    }
+    for condition in conditions:
+        if all(_matches(condition[key], text) for key, text in seen.items() if condition.get(key)):
+            return condition["action"].upper() == "RETRY"
+    return True
+
+
+def _matches(pattern: str, text: str) -> bool:
+    """A pattern may end in ``*``."""
+    return text.startswith(pattern[:-1]) if pattern.endswith("*") else text == pattern

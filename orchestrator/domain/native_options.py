@@ -27,7 +27,7 @@ class NativeOptions:
     directory: str = ""
     """Directory from which it was submitted; empty if unknown."""
     worlds: int | None = None
-    """Worlds of the whole gang, for a training that continues a run; None where not given."""
+    """Worlds of the whole gang, for a training that continues a run; None: as before."""
     stall_timeout: float | None = None
     """Seconds without an iteration after which a rank counts as stuck."""
     log_limit: int = LOG_LIMIT
@@ -36,18 +36,18 @@ class NativeOptions:
     @classmethod
     def read(cls, environment: Mapping[str, str]) -> NativeOptions:
         """Read the options in a node's variables. Raises MalformedOptions."""
-        given = {name[7:]: value for name, value in environment.items() if name.startswith("MUSTER_")}
-        worlds = given.get("WORLDS", "")
+        variables = {name[7:]: value for name, value in environment.items() if name.startswith("MUSTER_")}
+        worlds = variables.get("WORLDS", "")
         try:
             return cls(
-                is_native=bool(given.get("ON_CHILD_FAILURE")),
-                on_child_failure=given.get("ON_CHILD_FAILURE", "ignore"),
-                preemptible=given.get("PREEMPTIBLE") == "1",
-                run=given.get("RUN", ""),
-                directory=given.get("DIRECTORY", ""),
+                is_native=bool(variables.get("ON_CHILD_FAILURE")),
+                on_child_failure=variables.get("ON_CHILD_FAILURE", "ignore"),
+                preemptible=variables.get("PREEMPTIBLE") == "1",
+                run=variables.get("RUN", ""),
+                directory=variables.get("DIRECTORY", ""),
                 worlds=int(worlds) if worlds.isdecimal() and len(worlds) < 10 else None,
-                stall_timeout=float(given["STALL_TIMEOUT"]) if "STALL_TIMEOUT" in given else None,
-                log_limit=int(given.get("LOG_LIMIT") or LOG_LIMIT),
+                stall_timeout=float(variables["STALL_TIMEOUT"]) if "STALL_TIMEOUT" in variables else None,
+                log_limit=int(variables.get("LOG_LIMIT") or LOG_LIMIT),
             )
         except ValueError as error:
             raise MalformedOptions(f"a MUSTER_* variable is malformed: {error}") from None

@@ -48,5 +48,5 @@ def named(name: str, job: str) -> str:
 
 
 def array_of(size: int | None) -> str:
-    """What the AWS Batch API states of an array whose children are not all over."""
+    """What the AWS Batch API states of an array some of whose children have not ended."""
     return f"an array of {size}"

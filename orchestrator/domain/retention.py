@@ -7,10 +7,11 @@ nothing changes here.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
+
+from orchestrator.domain.units import SECONDS, amount
 
 A_DAY = 24 * 3600 * 1000
 """Milliseconds."""
@@ -20,17 +21,22 @@ TRIAL_DAYS = 7
 """After an upgrade, in which a controller only logs what it would take."""
 TAG = "muster:retention"
 """Tag of a job queue: its rule."""
+_LONGEST = 10**6 * A_DAY
 OFF = "off"
 """The rule that keeps everything."""
-_UNITS = {"m": 60_000, "h": 3_600_000, "d": A_DAY}
+_UNITS = {unit: 1000 * SECONDS[unit] for unit in "mhd"}
 
 
 def age_of(text: str) -> int:
     """Milliseconds of a time such as ``90d``, ``36h`` or ``45m``. Raises ValueError, in one line."""
-    match = re.fullmatch(r"(\d{1,6}(?:\.\d{1,3})?)\s*([mhd])", text.strip())
-    if match is None:
-        raise ValueError(f"{text[:40]!r}: expected days, hours or minutes, such as 90d, 36h or 45m")
-    return int(float(match[1]) * _UNITS[match[2]])
+    expected = "days, hours or minutes, such as 90d, 36h or 45m"
+    try:
+        age = int(amount(text, _UNITS, expected))
+    except ValueError as error:
+        raise ValueError(f"{text[:40]!r}: {error}") from None
+    if age > _LONGEST:
+        raise ValueError(f"{text[:40]!r}: expected {expected}")
+    return age
 
 
 def rule_of(text: str) -> int | None:
@@ -107,7 +113,7 @@ class RunFacts:
 
     name: str
     epoch: int = 0
-    """The highest that a controller has claimed: another one tells that an attempt has begun since."""
+    """The highest that a controller has claimed: another one means that an attempt has started since."""
     results: tuple[str, ...] = ()
     """Files and directories that are neither Muster's records of the run nor its logs and outcomes."""
     logged: frozenset[str] = frozenset()

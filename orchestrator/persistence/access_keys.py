@@ -23,8 +23,7 @@ from orchestrator import machine
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError
 from orchestrator.domain.identifiers import ACCESS_KEY_ID, SHARE
 from orchestrator.persistence.own_models import AccessKey
-from orchestrator.persistence.own_secrets import OwnSecrets
-from orchestrator.persistence.sealing import SealError
+from orchestrator.persistence.own_secrets import OwnSecrets, SealError
 from shared_store.volume.layout import NAME
 
 INTERVAL = 1.0
@@ -80,7 +79,7 @@ def share_of_name(name: str) -> str:
 
 
 class KeyStore:
-    """The keys of a database: what the database had at the last look is in memory, and a look takes place every second.
+    """The keys of a database: what the database had at the last poll is in memory, and a poll takes place every second.
 
     So no request waits for the database, and whatever another process makes or deletes is seen within that second.
     """
@@ -88,51 +87,51 @@ class KeyStore:
     def __init__(self, own: OwnSecrets) -> None:
         """Raises DatabaseError."""
         self._database, self._seal = own.database, own.seal
-        self._looking = threading.Lock()
+        self._polling = threading.Lock()
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
         self._is_failing = False
-        """Whether the last look failed as none should: one line of the log says so."""
-        self._looked = 0.0
-        """When the last look began (monotonic [s])."""
+        """Whether the last poll failed as none should: one line of the log says so."""
+        self._polled = 0.0
+        """When the last poll began (monotonic [s])."""
         self._rows: Sequence[Row[Any]] = ()
         self._keys: Mapping[str, Key] = {}
-        self._look()
+        self._poll()
 
     def current(self) -> Mapping[str, Key]:
-        """The keys by access key id, as they were at the last look; cheap enough for every request."""
+        """The keys by access key id, as they were at the last poll; cheap enough for every request."""
         return self._keys
 
     @property
     def is_empty(self) -> bool:
-        """Whether the database had no key, not even a damaged one, at the last look."""
+        """Whether the database had no key, not even a damaged one, at the last poll."""
         return not self._rows
 
     def load(self) -> Mapping[str, Key]:
         """The keys by access key id, as the database has them now. Raises DatabaseError."""
-        with self._looking:
-            self._look()
+        with self._polling:
+            self._poll()
         return self._keys
 
-    def look_again(self) -> None:
-        """Look for a key that another process may just have made; callers who wait for the same look share it.
+    def refresh(self) -> None:
+        """Poll for a key that another process may just have made; callers who wait for the same poll share it.
 
         Where the database does not answer in time, what was read last stays in force.
         """
-        asked = machine.monotonic()
-        if self._looking.acquire(timeout=PATIENCE):
+        requested = machine.monotonic()
+        if self._polling.acquire(timeout=PATIENCE):
             try:
-                if self._looked <= asked:
-                    self._look_safely()
+                if self._polled <= requested:
+                    self._poll_safely()
             finally:
-                self._looking.release()
+                self._polling.release()
 
     def start(self) -> None:
-        """Look every second from now on."""
+        """Poll every second from now on."""
         self._thread = machine.thread("keys", self._loop)
 
     def close(self) -> None:
-        """Look no more."""
+        """Poll no more."""
         self._ending.set()
         if self._thread is not None:
             self._thread.join(PATIENCE)
@@ -194,29 +193,29 @@ class KeyStore:
         """Delete a key: this process refuses it from its next request on, others within a second. Raises KeyUsageError, DatabaseError."""
         with self._database.session() as session:
             deleted = session.execute(delete(AccessKey).where(AccessKey.name == name).returning(AccessKey.name)).all()
-        there = ", ".join(each.name for each in self.load().values()) or "no key"
+        present = ", ".join(each.name for each in self.load().values()) or "no key"
         if not deleted:
-            raise KeyUsageError(f"there is no key {name!r}; there is {there}")
+            raise KeyUsageError(f"there is no key {name!r}; there is {present}")
 
     def _loop(self) -> None:
         while not self._ending.wait(INTERVAL):
-            with self._looking:
-                self._look_safely()
+            with self._polling:
+                self._poll_safely()
 
-    def _look_safely(self) -> None:
+    def _poll_safely(self) -> None:
         try:
-            self._look()
+            self._poll()
             self._is_failing = False
         except Unavailable:
-            pass  # said by the controller; the keys that were read last stay in force
-        except Exception:  # whatever it was, the next look sees keys that are deleted meanwhile
+            pass  # reported by the controller; the keys that were read last stay in force
+        except Exception:  # whatever it was, the next poll sees keys that are deleted meanwhile
             if not self._is_failing:
                 log.exception("the keys can't be read; those that were read last stay in force")
             self._is_failing = True
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Read the rows, and open them where they have changed."""
-        self._looked = machine.monotonic()
+        self._polled = machine.monotonic()
         with self._database.session() as session:
             rows = session.execute(select(_TABLE).order_by(_TABLE.c.created_at, _TABLE.c.name)).all()
         if rows != self._rows:

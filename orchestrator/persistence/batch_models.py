@@ -13,12 +13,11 @@ from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column, relationship,
 
 from orchestrator import machine
 from orchestrator.domain.attempt import NOT_STARTED
-from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.hosts import Placement
 from orchestrator.domain.job import AWS_CHILD_FAILED, AWS_ENDINGS, RunTime, Status, check_transition
 from orchestrator.domain.reasons import Reason
-from orchestrator.persistence.columns import Names, storable
+from orchestrator.persistence.columns import Names, bounded, written_out
 from orchestrator.persistence.gangs import gangs
 
 
@@ -211,9 +210,7 @@ class Job(Base):
     )
     """The array that it is a child of."""
 
-    @validates("status_reason", "stop_reason")
-    def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
+    _bounded = validates("status_reason", "stop_reason")(bounded)
 
     @property
     def gang(self) -> GangSpec:
@@ -323,13 +320,8 @@ class Attempt(Base):
     """By index; none where the row was damaged."""
     job: Mapped[Job] = relationship(back_populates="attempts")
 
-    @validates("status_reason")
-    def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
-
-    @validates("fault")
-    def _storable(self, _key: str, fault: str | None) -> str | None:
-        return None if fault is None else storable(fault)
+    _bounded = validates("status_reason")(bounded)
+    _written_out = validates("fault")(written_out)
 
     @property
     def environment(self) -> str:
@@ -393,9 +385,7 @@ class Node(Base):
     log_prefix: Mapped[str | None] = mapped_column(default=None)
     """The stream's name begins with it; None: with the name of the job."""
 
-    @validates("reason", "error", "status_reason")
-    def _storable(self, _key: str, text: str | None) -> str | None:
-        return None if text is None else storable(text)
+    _written_out = validates("reason", "error", "status_reason")(written_out)
 
     @property
     def placement(self) -> Placement:
@@ -403,7 +393,7 @@ class Node(Base):
 
     def shown(self) -> dict[str, Any]:
         """Its part of the API's answer, as far as known."""
-        given = {"index": self.index, "host": self.host, "gpus": list(self.gpus), "cpus": self.cpus}
+        allocated = {"index": self.index, "host": self.host, "gpus": list(self.gpus), "cpus": self.cpus}
         ended = {"exitCode": self.exit_code, "reason": self.reason, "error": self.error}
         known = {
             "address": self.address,
@@ -413,7 +403,7 @@ class Node(Base):
             "devices": None if self.devices is None else list(self.devices),
         }
         return {
-            **given,
+            **allocated,
             "memory": self.memory,
             **{key: value for key, value in known.items() if value is not None},
             **(ended if self.exit_code is not None else {}),

@@ -84,16 +84,16 @@ def _keys(path: Path, keys: KeyStore) -> list[Key]:
         first = error.errors(include_input=False)[0]
         where = ".".join(str(part) for part in first["loc"])
         raise KeysError(f"{path}: {where + ': ' if where else ''}{first['msg']}; {advice}") from None
-    there = dict(keys.load())
+    present = dict(keys.load())
     added: list[Key] = []
     for key in read:
-        if key.access_key_id in there:
+        if key.access_key_id in present:
             continue
-        if any(key.name == each.name for each in there.values()):
+        if any(key.name == each.name for each in present.values()):
             raise KeysError(
                 f"{path}: there is another key {key.name} already; give this one another name in the file, or take it out"
             )
-        there[key.access_key_id] = key
+        present[key.access_key_id] = key
         added.append(key)
     return added
 

@@ -5,43 +5,22 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any, Self
+from typing import Any
 
 from sqlalchemy import ColumnElement, func, or_, select, union_all
 from sqlalchemy.orm import Session, defer, selectinload
 
-from orchestrator.domain.errors import RequestError
 from orchestrator.persistence.batch_models import Job
-from orchestrator.persistence.keyset import behind
+from orchestrator.persistence.keyset import Cursor, behind
 
 _KEYS = (Job.created_at, Job.id)
 _MOST_PARTS = 100
 """Parts of the list that are read one by one; where there are more, all jobs are looked through."""
 
 
-@dataclass(frozen=True)
-class Cursor:
+def place_of(job: Job) -> Cursor:
     """The place of a job in the list."""
-
-    created_at: int
-    id: str
-
-    @classmethod
-    def of(cls, job: Job) -> Self:
-        """The place of this job."""
-        return cls(job.created_at, job.id)
-
-    @classmethod
-    def read(cls, text: str) -> Self:
-        """What :meth:`__str__` has written. Raises RequestError."""
-        created_at, _, job = text.partition("-")
-        is_time = created_at.isascii() and created_at.isdecimal() and len(created_at) <= 15
-        if not (is_time and job and job.isascii() and job.isprintable()):
-            raise RequestError(f"{text[:100]!r} is not a place in the list of jobs; leave it out for the newest")
-        return cls(int(created_at), job)
-
-    def __str__(self) -> str:
-        return f"{self.created_at}-{self.id}"
+    return Cursor(job.created_at, job.id)
 
 
 @dataclass(frozen=True)
@@ -79,7 +58,7 @@ def read_page(
     backwards = before is not None
     query = select(*_KEYS).where(Job.parent.is_(None), *conditions)
     if (place := before or after) is not None:
-        query = query.where(behind(_KEYS, (place.created_at, place.id), (not backwards,) * 2))
+        query = query.where(behind(_KEYS, (place.at, place.id), (not backwards,) * 2))
     query = query.order_by(*_order(Job, backwards)).limit(most + 1)
     parts = [select(query.where(*part).subquery()) for part in _parts(queues, statuses)]
     if not parts:

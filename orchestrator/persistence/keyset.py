@@ -3,10 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Self
 
 from sqlalchemy import ColumnElement, and_, or_
 from sqlalchemy.orm import InstrumentedAttribute
+
+from orchestrator.domain.errors import RequestError
+
+
+@dataclass(frozen=True)
+class Cursor:
+    """A place in a list of jobs that is ordered by a time and their ids; by default before all of them."""
+
+    at: int = -1
+    """Unix time [ms]."""
+    id: str = ""
+
+    @classmethod
+    def read(cls, text: str) -> Self:
+        """What :meth:`__str__` has written. Raises RequestError."""
+        at, _, job = text.partition("-")
+        is_time = at.isascii() and at.isdecimal() and len(at) <= 15
+        if not (is_time and job and job.isascii() and job.isprintable()):
+            raise RequestError(f"{text[:100]!r} is not a place in the list of jobs; leave it out to begin anew")
+        return cls(int(at), job)
+
+    def __str__(self) -> str:
+        return f"{self.at}-{self.id}"
 
 
 def behind(

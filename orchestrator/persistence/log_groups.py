@@ -20,9 +20,9 @@ def check_room(session: Session, names: Collection[str], owner: str | None) -> N
     """Raise RequestError where those of the groups that do not exist yet would be too many for their owner, a key."""
     if not (more := _missing(session, names)):
         return
-    there = session.scalar(select(func.count()).where(LogGroup.owner == owner)) or 0
-    if there + len(more) > MOST:
-        raise RequestError(f"{owner} has {there} log groups, and may have {MOST}; delete some, or log to {LOG_GROUP}")
+    present = session.scalar(select(func.count()).where(LogGroup.owner == owner)) or 0
+    if present + len(more) > MOST:
+        raise RequestError(f"{owner} has {present} log groups, and may have {MOST}; delete some, or log to {LOG_GROUP}")
 
 
 def add_missing(session: Session, names: Collection[str], owner: str | None) -> None:

@@ -8,9 +8,8 @@ from __future__ import annotations
 from sqlalchemy import ForeignKey, Index
 from sqlalchemy.orm import Mapped, mapped_column, relationship, validates
 
-from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.persistence.batch_models import Base, Job, now
-from orchestrator.persistence.columns import storable
+from orchestrator.persistence.columns import bounded
 
 
 class ClockState(Base):
@@ -155,9 +154,7 @@ class AutomaticEvaluation(Base):
     problem: Mapped[str | None] = mapped_column(default=None)
     """Why the evaluation that was due last could not be submitted."""
 
-    @validates("problem")
-    def _bounded(self, _key: str, reason: str | None) -> str | None:
-        return None if reason is None else excerpt(storable(reason), LONGEST_REASON)
+    _bounded = validates("problem")(bounded)
 
 
 class WebhookDelivery(Base):

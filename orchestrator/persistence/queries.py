@@ -42,10 +42,13 @@ def ask_to_end(session: Session, which: ColumnElement[bool], reason: str, *, can
     unasked = Job.stop_reason.is_(None) if cancel else or_(Job.stop_reason.is_(None), Job.cancelled)
     has_free_child = select(child.id).where(child.parent == Job.id, free(child)).exists()
     array = and_(which, Job.kind == "array", Job.status.not_in(TERMINAL), unasked, has_free_child)
-    for asked in (array, and_(which, free(Job))):  # an array first, while its children show whether they can be asked
-        note_changed(session, session.scalars(select(Job.id).where(asked)))
+    for requested in (
+        array,
+        and_(which, free(Job)),
+    ):  # an array first, while its children show whether they can be asked
+        note_changed(session, session.scalars(select(Job.id).where(requested)))
         changes = {"stop_reason": reason, "cancelled": cancel}
-        session.execute(update(Job).where(asked).values(changes), execution_options={"synchronize_session": False})
+        session.execute(update(Job).where(requested).values(changes), execution_options={"synchronize_session": False})
 
 
 def states_of(session: Session, ids: Collection[str]) -> dict[str, tuple[Status, int | None, int]]:

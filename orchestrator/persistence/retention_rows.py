@@ -9,16 +9,13 @@ from sqlalchemy import ColumnElement, and_, case, delete, false, not_, or_, sele
 from sqlalchemy.orm import Session, aliased
 
 from orchestrator.domain.job import TERMINAL
-from orchestrator.domain.retention import A_DAY, JobFacts, RetentionReference, RetentionRules
+from orchestrator.domain.retention import JobFacts, RetentionReference, RetentionRules
 from orchestrator.persistence.batch_models import Attempt, Dependency, Job, JobDefinition, Node, RunRecord
 from orchestrator.persistence.job_counts import ArrayRole, note_rows
-from orchestrator.persistence.own_models import AutomaticEvaluation, RunUse, ShareUsage, WebhookDelivery
+from orchestrator.persistence.own_models import AutomaticEvaluation, RunUse, WebhookDelivery
 
 _SUBMITTED = {"MUSTER_DIRECTORY", "MUSTER_SPEC"}
 """Variables of a definition which `muster submit` and the like compile (:mod:`orchestrator.spec.compile`)."""
-
-_UNUSED = 90 * A_DAY
-"""Milliseconds after which the use of a share is forgotten."""
 
 
 def jobs_of_runs(
@@ -110,13 +107,6 @@ def forget_owners(session: Session, runs: Collection[str]) -> None:
     """Forget the owners of runs that are not in the store any more and that no job is about to create."""
     named = select(Job.run).where(Job.run.in_(runs))
     session.execute(delete(RunRecord).where(RunRecord.name.in_(runs), RunRecord.name.not_in(named)))
-
-
-def forget_usage(session: Session, moment: int) -> None:
-    """Forget the use of shares that have used nothing for long, at a moment (steady time [ms]): of the longest half-life, a week, less than
-    0.02 % is left.
-    """
-    session.execute(delete(ShareUsage).where(ShareUsage.as_of < moment - _UNUSED))
 
 
 def _forget_definitions(session: Session, arns: Collection[str]) -> None:

@@ -129,7 +129,8 @@ class Database:
             **({} if is_in_memory(parsed) else {"pool_timeout": _POOL_TIMEOUT}),
         )
         if is_sqlite:
-            event.listen(engine, "do_connect", self._check_before_connect)
+            # SQLite would make a new, empty file in place of one that was deleted
+            event.listen(engine, "do_connect", lambda *_: self.check())
             event.listen(engine, "connect", _tune_sqlite)
         return engine
 
@@ -140,7 +141,7 @@ class Database:
 
     @classmethod
     def at(cls, home: Path, other: str | None = None, *, beside: bool = False) -> Database:
-        """The database of a Muster home directory: its SQLite file, or the ``other`` that its controller is given, a URL or a path."""
+        """The database of a Muster home directory: its SQLite file, or the ``other`` that its controller uses, a URL or a path."""
         return cls(database_url(home, other), beside=beside)
 
     @contextmanager
@@ -226,10 +227,6 @@ class Database:
     def shown(self) -> str:
         """Its URL, without the password."""
         return shown(str(self.engine.url))
-
-    def _check_before_connect(self, *_: object) -> None:
-        """SQLite would make a new, empty file in place of one that was deleted."""
-        self.check()
 
     def _reserve(self) -> None:
         """Have SQLite own space that no other program on the volume can take: free pages in its file, and a write-ahead log as long as it
@@ -322,7 +319,7 @@ class Database:
 
 def _make_private(path: Path) -> None:
     """Create an SQLite file for its user alone, or close one to others: the environments of jobs hold secrets."""
-    with suppress(OSError):  # said by SQLite, in its own words
+    with suppress(OSError):  # SQLite reports it in its own words
         os.close(_private(str(path), os.O_RDWR | os.O_CREAT))
     for name in (path.name, f"{path.name}-wal", f"{path.name}-shm"):  # SQLite gives new ones the mode of the first
         with suppress(OSError):
@@ -377,7 +374,7 @@ class _Session(Session):
 
 
 @event.listens_for(_Session, "after_commit")
-def _tell(session: Session) -> None:
+def _report_commit(session: Session) -> None:
     jobs, ids = session.info.pop("jobs", None), session.info.pop("ids", None)
     database = session.info["database"]
     database.counts.add(session.info.pop("counts", {}))

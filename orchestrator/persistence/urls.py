@@ -29,5 +29,5 @@ def connect_args(url: URL) -> dict[str, Any]:
     """Options that reveal a vanished PostgreSQL server within seconds; options in the URL take precedence."""
     if url.get_backend_name() != "postgresql":
         return {}
-    told = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
-    return {name: value for name, value in {**told, "tcp_user_timeout": 10_000}.items() if name not in url.query}
+    defaults = {"connect_timeout": 10, "keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}
+    return {name: value for name, value in {**defaults, "tcp_user_timeout": 10_000}.items() if name not in url.query}

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import chain, groupby
 from math import inf
+from operator import attrgetter
 
 from orchestrator.domain.hosts import Placement
 from orchestrator.scheduling.free_resources import Allocation, FreeResources
@@ -111,7 +112,8 @@ class _Pass:
             self._serve([self._line(queues[name], jobs[name]) for name in equal])
         for name in jobs.keys() - queues.keys():
             self.orders[name] = QueueOrder(dispatch_order(None, jobs[name], {}, RoundRobin(), bool), None)
-        report = WaitReport(self.now, self.orders, self.reservations, self.free, self.preempts, self.snapshot.drift)
+        preempted = {each.job for each in self.preempts}
+        report = WaitReport(self.now, self.orders, self.reservations, self.free, preempted, self.snapshot.drift)
         return Decisions(
             tuple(self.starts),
             tuple(self.preempts),
@@ -164,7 +166,10 @@ class _Pass:
         served: dict[str, Moment] = {}
         for (name, _), at in turns.served.items():
             served[name] = max(at, served.get(name, at))
-        line_up = sorted(lines, key=lambda line: turn(served.get(line.queue.name), min(line.jobs, key=_age)))
+        line_up = sorted(
+            lines,
+            key=lambda line: turn(served.get(line.queue.name), min(line.jobs, key=attrgetter("created_at", "job"))),
+        )
         merged = in_turns([line.each() for line in line_up], lambda each: bool(each[0].cache.possible(each[1].shape)))
         taken = {head.job for _, head in heads}
         return chain(heads, (each for each in merged if each[1].job not in taken))
@@ -234,7 +239,3 @@ class _Pass:
             self.reservations.append(reservation)
             for each in self.caches.values():
                 each.add(reservation)
-
-
-def _age(job: Waiting) -> tuple[int, str]:
-    return job.created_at, job.job

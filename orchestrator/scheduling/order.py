@@ -134,7 +134,7 @@ def _by_shares(
     heap = [(score(queue, share, usage), share) for share in shares]
     heapq.heapify(heap)
     for line in shares.values():
-        line.sort(key=_by_priority, reverse=True)  # served from the end
+        line.sort(key=lambda job: (-job.priority, job.created_at, job.job), reverse=True)  # served from the end
     ordered: list[Waiting] = []
     while heap:
         used, share = heap[0]
@@ -146,7 +146,3 @@ def _by_shares(
         else:
             heapq.heappop(heap)
     return ordered
-
-
-def _by_priority(job: Waiting) -> tuple[int, int, str]:
-    return -job.priority, job.created_at, job.job

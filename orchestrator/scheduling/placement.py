@@ -19,12 +19,12 @@ def place(shape: Shape, free: Sequence[Host], most: int | None = None) -> tuple[
         free: The free part of each host, in the order in which hosts are filled.
         most: No more nodes than this; None for the gang's size.
 
-    Hosts that are away are taken only where the gang can't start without them.
+    Unavailable hosts are taken only where the gang can't start without them.
     """
-    there = [host for host in free if not host.away]
-    placements = _place(shape, there, most)
-    if placements is None and len(there) < len(free) and (most is None or most >= shape.minimum):
-        return _place(shape, [*there, *(host for host in free if host.away)], shape.minimum)
+    available = [host for host in free if not host.unavailable]
+    placements = _place(shape, available, most)
+    if placements is None and len(available) < len(free) and (most is None or most >= shape.minimum):
+        return _place(shape, [*available, *(host for host in free if host.unavailable)], shape.minimum)
     return placements
 
 
@@ -71,15 +71,15 @@ def _too_few_hosts(shape: Shape, hosts: Sequence[Host]) -> str | None:
     """A message that there are too few hosts, if each takes one node; None if that is not the reason."""
     if not all(host.single for host in hosts):
         return None
-    wanted = {"": (shape.minimum, len(hosts))}
+    demanded = {"": (shape.minimum, len(hosts))}
     for node, indices in shape.groups:
         count = sum(index < shape.minimum for index in indices)
-        wanted[f" with {amounts(node)}"] = count, sum(_room(node, host) for host in hosts)
-    for what, (count, found) in wanted.items():
+        demanded[f" with {amounts(node)}"] = count, sum(_room(node, host) for host in hosts)
+    for what, (count, found) in demanded.items():
         if found < count:
             at_least = "at least " if shape.minimum < len(shape.nodes) else ""
-            there = f"there {'is' if found == 1 else 'are'} {found}"
-            return f"needs {at_least}{count} hosts{what}, one for each node; {there}"
+            present = f"there {'is' if found == 1 else 'are'} {found}"
+            return f"needs {at_least}{count} hosts{what}, one for each node; {present}"
     return None
 
 
@@ -110,16 +110,16 @@ def needs(shape: Shape) -> str:
     return f"needs {at_least}{nodes} with {amounts(shape.least)} in all"
 
 
-def shortage(wanted: Resources, free: Resources) -> str:
+def shortage(requested: Resources, free: Resources) -> str:
     """What is missing: ``1 of 2 CPUs, 512 MiB of 1 GiB short``; empty if enough is free in all."""
     parts = []
-    if free.cpus + EPSILON < wanted.cpus:
-        lack = wanted.cpus - max(0.0, free.cpus)
-        parts.append(f"{_number(lack) if lack >= 0.01 else 'less than 0.01'} of {count_of(wanted.cpus, 'CPU')}")
-    if free.gpus < wanted.gpus:
-        parts.append(f"{wanted.gpus - max(0, free.gpus)} of {count_of(wanted.gpus, 'GPU')}")
-    if free.memory < wanted.memory:
-        parts.append(f"{_size(wanted.memory - max(0, free.memory))} of {_size(wanted.memory)}")
+    if free.cpus + EPSILON < requested.cpus:
+        lack = requested.cpus - max(0.0, free.cpus)
+        parts.append(f"{_number(lack) if lack >= 0.01 else 'less than 0.01'} of {count_of(requested.cpus, 'CPU')}")
+    if free.gpus < requested.gpus:
+        parts.append(f"{requested.gpus - max(0, free.gpus)} of {count_of(requested.gpus, 'GPU')}")
+    if free.memory < requested.memory:
+        parts.append(f"{_size(requested.memory - max(0, free.memory))} of {_size(requested.memory)}")
     return f"{', '.join(parts)} short" if parts else ""
 
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import cached_property
 from math import inf
-from typing import Protocol
 
 from orchestrator.domain.gang import Shape
 from orchestrator.domain.reasons import Reason, named
@@ -35,13 +34,6 @@ class QueueOrder:
     """None: there is no such queue."""
 
 
-class _Preemption(Protocol):
-    @property
-    def job(self) -> str: ...
-    @property
-    def by(self) -> str: ...
-
-
 class WaitReport:
     """The result of a pass: each queue's order, and each waiting job's reason. Decided once, worded on request."""
 
@@ -51,7 +43,7 @@ class WaitReport:
         orders: Mapping[str, QueueOrder],
         reservations: Sequence[Reservation],
         free: FreeResources,
-        preempts: Sequence[_Preemption],
+        preempted: Collection[str],
         drift: int,
     ) -> None:
         """Args:
@@ -59,17 +51,11 @@ class WaitReport:
         orders: By queue.
         reservations: In the order in which they came.
         free: The free resources after the pass.
-        preempts: The preempted jobs, and the jobs for which they leave.
+        preempted: The preempted jobs.
         drift: Difference of Unix time to the pass's clock [ms].
         """
-        self._drift = drift
-        self._now, self._queues, self._reservations, self._resources = (
-            now,
-            orders,
-            {reservation.job.job: reservation for reservation in reservations},
-            free,
-        )
-        self._preempted = {each.job for each in preempts}
+        self._now, self._queues, self._resources, self._preempted, self._drift = now, orders, free, preempted, drift
+        self._reservations = {reservation.job.job: reservation for reservation in reservations}
         self._orders: dict[str, tuple[str, ...]] = {}
         self._common: dict[tuple[str, Shape], tuple[bool, Reason]] = {}
 

@@ -64,7 +64,7 @@ class ComputeEnvironment:
     engine: str | None = None
     """Only hosts of this one; None: of any."""
     unknown: str = ""
-    """Why the engine has not told its hosts yet; empty once it has."""
+    """Why the engine has not reported its hosts yet; empty once it has."""
 
 
 @dataclass(frozen=True)

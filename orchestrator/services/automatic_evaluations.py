@@ -104,7 +104,7 @@ class AutomaticEvaluations:
     def _loop(self) -> None:
         self._on_store("unclaimed checkpoints", self._let_go)
         while not self._ending.wait(self._interval):
-            if self._controller.reconciler.trouble is None and self._controller.access.problem() is None:
+            if self._controller.trouble is None and self._controller.access.problem() is None:
                 self.look()
 
     def look(self) -> None:

@@ -214,7 +214,7 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
                 "or with a module:Class of your own whose load_state_dict reads them"
             )
         return  # whether a class of the user's own reads them, or is read, only the rank can say
-    settings, given = manifest["settings"], spec.train.given()
+    settings, given = manifest["settings"], spec.train.overrides()
     fixed = fixed_settings(ALGORITHMS.get(name), settings, of_clone=True)
     asked = [key for key in fixed if setting_at(given, key) is not None]
     if difference := first_difference(settings, given, asked):

@@ -185,7 +185,7 @@ def using(controller: Controller, *runs: str, cites: bool = True) -> Iterator[No
         for run in runs:
             stack.enter_context(controller.access.users.using(run))
         if cites:  # before the runs are released, so that retention looks at the store again before it takes one
-            stack.callback(controller.retention.stored.look_again)
+            stack.callback(controller.retention.stored.refresh)
         yield
 
 

@@ -12,7 +12,7 @@ from orchestrator.persistence.batch_models import Job
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
 from orchestrator.services.spec_submission import submit_spec
-from orchestrator.spec.evaluations import document_beside, evaluation_document
+from orchestrator.spec.evaluations import evaluation_document
 from orchestrator.spec.model import validate
 from shared_store.volume.layout import Run
 
@@ -47,7 +47,8 @@ def record(controller: Controller, actor: Actor, run: Run, section: Mapping[str,
 def _beside(
     controller: Controller, actor: Actor, run: Run, kind: str, section: Mapping[str, Any], directory: str
 ) -> Job:
-    document = document_beside(run.name, _trained(controller, actor, run), kind, section)
+    one_cpu = {"cpus": 1, "memory": "2GiB"}
+    document = evaluation_document(run.name, _trained(controller, actor, run), section, kind=kind, resources=one_cpu)
     return _submitted(controller, actor, document, directory, f"{kind} of {run.name}")
 
 

@@ -183,7 +183,7 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         )
     name = after.train.algorithm
     kind = ALGORITHMS.get(name)
-    if difference := first_difference(before.train.given(), after.train.given(), fixed_settings(kind)):
+    if difference := first_difference(before.train.overrides(), after.train.overrides(), fixed_settings(kind)):
         may = difference[0] not in fixed_settings(kind, of_clone=True)
         key, *values = innermost(*difference)
         old, new = ("not set" if value is None else shown(value) for value in values)
@@ -205,7 +205,7 @@ def _check_rate(run: Run, chosen: Checkpoint, after: Spec, assignments: Sequence
     name = after.train.algorithm
     key, hint = _RATES[name]
     asked = setting_at(override({}, assignments), f"train.{name}.{key}")  # whatever section the assignment gives whole
-    if asked is None or (name == "ppo" and after.train.given().get("schedule") == "fixed"):
+    if asked is None or (name == "ppo" and after.train.overrides().get("schedule") == "fixed"):
         return
     try:
         saved = chosen.manifest

@@ -8,9 +8,10 @@ from typing import Any
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.retention import RunNeeded
-from orchestrator.control.retention_looks import PassCursor, Whose
+from orchestrator.control.retention_facts import Requester
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.retention import age_of
+from orchestrator.persistence.keyset import Cursor
 from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Actor, Operation
 from shared_store.volume import contents
@@ -49,7 +50,7 @@ def delete(controller: Controller, actor: Actor, name: str) -> dict[str, Any]:
     """
     run = permitted_run(controller, actor, name, Operation.DELETE_RUN)
     controller.writes.check(adds=False)
-    return controller.retention.delete(run.name, Whose(actor.name, actor.queues))
+    return controller.retention.delete(run.name, Requester(actor.name, actor.queues))
 
 
 def next_part(controller: Controller, actor: Actor, after: str, older_than: str, *, take: bool) -> dict[str, Any]:
@@ -69,23 +70,20 @@ def next_part(controller: Controller, actor: Actor, after: str, older_than: str,
     if take:
         actor.check(Operation.TAKE_GARBAGE)
         controller.writes.check(adds=False)
-    whose = Whose(actor.name, actor.queues)
-    try:
-        place = PassCursor.of(after) if after else PassCursor()
-    except ValueError as error:
-        raise ClientError(str(error)) from None
+    by = Requester(actor.name, actor.queues)
+    place = Cursor.read(after) if after else Cursor()
     try:
         older = age_of(older_than) if older_than else None
     except ValueError as error:
         raise ClientError(f"older_than: {error}") from None
     if not after:
-        controller.retention.stored.look_again()  # others may have changed the store
+        controller.retention.stored.refresh()  # others may have changed the store
     found: list[dict[str, Any]] = []
     deadline = time.monotonic() + _A_PART
     while True:
         rules = controller.retention.rules()
         rules = rules if older is None else replace(rules, default=older)
-        looks, following = controller.retention.step(place, rules, take=take, whose=whose)
+        looks, following = controller.retention.step(place, rules, take=take, by=by)
         found += looks
         if following is None or time.monotonic() > deadline:
             return {"runs": found, "next": None if following is None else str(following)}

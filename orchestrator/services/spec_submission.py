@@ -189,7 +189,7 @@ def commit_submission(controller: Controller, call: Callable[[Known], T]) -> T:
     controller.engines.capacity(patience=FRESH)  # before the lock: its holder must not wait for an engine
     controller.writes.check(adds=True)
     result = with_store(controller, call)
-    controller.alarm.ring()
+    controller.work_queue.alarm.set()
     return result
 
 

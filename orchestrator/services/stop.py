@@ -61,5 +61,5 @@ def stop(controller: Controller, actor: Actor, job_ids: Sequence[str], reason: s
                 continue
             except ClientError as error:
                 refused[job_id] = error
-    controller.alarm.ring()
+    controller.work_queue.alarm.set()
     return refused

@@ -19,41 +19,30 @@ AUTOMATIC_TAG = "muster:automatic-evaluation"
 
 
 def evaluation_document(
-    run: str, trained: Mapping[str, Any], section: Mapping[str, Any], name: str | None = None, kind: str = "evaluate"
+    run: str,
+    trained: Mapping[str, Any],
+    section: Mapping[str, Any],
+    name: str | None = None,
+    kind: str = "evaluate",
+    resources: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The spec of a job that evaluates ``run`` on one node like those of its training.
+    """The spec of a job that evaluates or reads a checkpoint of ``run`` on one node.
 
     Args:
         run: Name of the run.
         trained: Spec of the training.
         section: What its section says beside the run.
         name: Of the job; ``KIND-RUN`` where None.
-        kind: Key of the section, one of :func:`shared_store.contract.plugins.evaluating`.
+        kind: Key of the section.
+        resources: Of the node; None: those of a node of the training, with at most one GPU.
     """
-    resources = dict(trained.get("resources") or {})
-    if resources.get("gpus"):
-        resources["gpus"] = 1
+    if resources is None:
+        like = trained.get("resources") or {}
+        resources = {**like, "gpus": 1} if like.get("gpus") else like
     return {
         **_kept(trained),
         "name": name or f"{kind}-{run}".replace(".", "-")[:100],
         **({"resources": resources} if resources else {}),
-        kind: {"run": run, **section},
-    }
-
-
-def document_beside(run: str, trained: Mapping[str, Any], kind: str, section: Mapping[str, Any]) -> dict[str, Any]:
-    """The spec of a job of one CPU that reads a checkpoint of ``run``.
-
-    Args:
-        run: Name of the run.
-        trained: Spec of the training.
-        kind: ``export`` or ``record``.
-        section: What that section says beside the run.
-    """
-    return {
-        **_kept(trained),
-        "name": f"{kind}-{run}".replace(".", "-")[:100],
-        "resources": {"cpus": 1, "memory": "2GiB"},
         kind: {"run": run, **section},
     }
 

@@ -9,7 +9,7 @@ from typing import Any
 from orchestrator.domain.errors import SpecError
 from orchestrator.spec import strict_yaml
 from orchestrator.spec.changes import override
-from orchestrator.spec.kept_files import Place, check_sizes, check_texts, refuse_paths, with_files
+from orchestrator.spec.kept_files import Place, check_texts, refuse_paths, with_files
 from orchestrator.spec.model import Spec, validate
 from shared_store.volume.files import DamagedFile, read_json
 
@@ -67,7 +67,6 @@ def from_document(document: Any, source: str, lines: Mapping[strict_yaml.Path, i
     """
     if isinstance(document, dict):
         refuse_paths(document, source, lines or {})
-        check_sizes(document, source, lines or {})
     return validate(document, source, lines or {})
 
 

@@ -10,7 +10,8 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -31,12 +32,104 @@ TextOf = Callable[[str], str | None]
 """The long text of a run by its SHA-256; None: it is not there."""
 Place = Callable[[], str | None]
 """The path of the store in which a job finds what its configuration names, asked where a check needs it; None: not on this machine."""
+Lines = Mapping[tuple[str | int, ...], int]
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """Where a document comes from, and what the checks of its files need; attributes as the arguments of :func:`with_files`."""
+
+    source: str
+    lines: Lines | None = None
+    task: str | None = None
+    base: Mapping[str, Any] = field(default_factory=dict)
+    store: Place = lambda: None
+    note: Note | None = None
+    text_of: TextOf = lambda _: None
+
+    def fields(self, document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any], str, KeptFile]]:
+        """Section, configuration, name and form of each field that may name a file, given or not; of tasks that are installed."""
+        for section in ("train", *plugins.evaluating()):
+            values = document.get(section)
+            config = (values.get("config") or {}) if isinstance(values, Mapping) else None
+            if not isinstance(values, Mapping) or not isinstance(config, Mapping):
+                continue
+            name = values.get("task", self.task)
+            for each, how in kept_files(task_config(name) if isinstance(name, str) else None).items():
+                yield section, config, each, how
+
+    def given(self, document: Mapping[str, Any]) -> Iterator[tuple[str, str, Any, KeptFile]]:
+        """Section, name, value and form of the fields that the document gives."""
+        return (
+            (section, name, config[name], how) for section, config, name, how in self.fields(document) if name in config
+        )
+
+    @contextmanager
+    def at(self, section: str, name: str) -> Iterator[None]:
+        """A block whose SpecError gets file, line and key of a field."""
+        try:
+            yield
+        except SpecError as error:
+            raise SpecError(f"{place_of((section, 'config', name), self.source, self.lines)}{error}") from None
+
+    def whole(self, section: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The configuration of a section, as far as it is known."""
+        rules = plugins.rules_of(section)
+        return {**self.base, **(rules.changes(values) if rules else values.get("config") or {})}
+
+    def check(self, path: str, how: KeptFile, config: Mapping[str, Any], name: str = "") -> None:
+        """Have another process check the file, since the parts of tasks belong to the worker.
+
+        ``config``: in which the file stands. Raises SpecError, in which ``name`` stands for the path.
+        """
+        if not how.check or any(find_spec(each) is None for each in how.needs):
+            return
+        command = [sys.executable, "-P", "-m", how.check, path]
+        if how.given:
+            command += ["--config", json.dumps({each: config[each] for each in how.given if each in config})]
+            command += ["--store", store] if (store := self.store()) is not None else []
+        response = subprocess.run(command, capture_output=True, text=True, check=False)
+        output = [line.replace(path, name or path, 1) for line in response.stderr.strip().splitlines()]
+        if response.returncode:
+            raise SpecError(output[-1] if output else f"{how.check} ended with exit code {response.returncode}")
+        if self.note is not None:
+            for line in output:
+                self.note(line)
+
+    def check_text(self, value: Any, name: str, how: KeptFile, config: Mapping[str, Any]) -> None:
+        """Check a text that stands in the place of a file. Raises SpecError."""
+        text = value.get("text") if isinstance(value, Mapping) else None
+        if how.form == "text" and isinstance(text, str):
+            with TemporaryDirectory() as folder:
+                path = Path(folder) / "text"
+                path.write_text(text, encoding="utf-8")
+                self.check(str(path), how, config, str(value.get("file") or name))
+
+    def check_again(self, document: Mapping[str, Any]) -> None:
+        """Check the texts of ``base`` where a section changes what their check depends on. Raises SpecError."""
+        for section, config, name, how in self.fields(document):
+            whole = self.whole(section, document[section])
+            changed = [key for key in how.given if whole.get(key) != self.base.get(key)]
+            if changed and name not in config:
+                with self.at(section, changed[0]):
+                    self.check_text(self.with_text(self.base.get(name), name), name, how, whole)
+
+    def with_text(self, value: Any, name: str) -> Any:
+        """A field with its text in the place of its digest, where that is to be had."""
+        if not is_reference(value):
+            return value
+        name = value.get("file", name)
+        if (text := self.text_of(value["sha256"])) is not None:
+            return {"file": name, "text": text}
+        if self.note is not None:
+            self.note(f"{name}: its text is not in the run: it is not tried here, but on the job's nodes")
+        return value
 
 
 def with_files(
     document: Mapping[str, Any],
     source: str,
-    lines: Mapping[tuple[str | int, ...], int] | None = None,
+    lines: Lines | None = None,
     *,
     task: str | None = None,
     base: Mapping[str, Any] | None = None,
@@ -62,128 +155,45 @@ def with_files(
     Raises:
         SpecError: A file can't be read, is too large, or its check refuses it; one line with file, line and key.
     """
-    result = dict(document)
-    for section, field, value, how in _fields(document, task):
+    result, origin = dict(document), _Origin(source, lines, task, base or {}, store, note, text_of)
+    for section, name, value, how in origin.given(document):
         if isinstance(value, str):
-            try:
-                content = _content(value, how, _Checked(how, _whole(section, document[section], base), store, note))
-            except SpecError as error:
-                raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
+            with origin.at(section, name):
+                content = _content(value, how)
+                origin.check(value, how, origin.whole(section, document[section]))
             values = result[section]
-            result[section] = {**values, "config": {**values["config"], field: content}}
-    _check_again(document, source, lines or {}, task, base or {}, store, note, text_of)
+            result[section] = {**values, "config": {**values["config"], name: content}}
+    origin.check_again(document)
     return result
 
 
-def refuse_paths(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
-    """Refuse paths in a document that a request brought: the files are not on this machine. Arguments as :func:`with_files`.
+def refuse_paths(document: Mapping[str, Any], source: str, lines: Lines) -> None:
+    """Refuse paths in a document that a request brought, whose files are not on this machine, and contents that are too large.
+
+    Arguments as :func:`with_files`.
 
     Raises:
-        SpecError: A path stands where the content of its file belongs; one line with key and line.
+        SpecError: A path stands where the content of its file belongs, or a content is too large; one line with key and line.
     """
-    for section, field, value, how in _fields(document):
-        if isinstance(value, str):
-            form = "{file: NAME, text: …}" if how.form == "text" else "the value in it"
-            raise SpecError(
-                f"{place_of((section, 'config', field), source, lines)}found a path; only `muster submit` and `muster run` read "
-                f"files, so write what the file holds: {form}"
-            )
-
-
-def check_sizes(document: Mapping[str, Any], source: str, lines: Mapping[tuple[str | int, ...], int]) -> None:
-    """Refuse a file's content that is too large, before anything else is done with it. Arguments as :func:`with_files`. Raises SpecError."""
-    for section, field, value, how in _fields(document):
-        try:
-            _check_size(str(value.get("file") or field) if isinstance(value, Mapping) else field, value, how)
-        except SpecError as error:
-            raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
+    origin = _Origin(source, lines)
+    for section, name, value, how in origin.given(document):
+        with origin.at(section, name):
+            if isinstance(value, str):
+                form = "{file: NAME, text: …}" if how.form == "text" else "the value in it"
+                raise SpecError(
+                    f"found a path; only `muster submit` and `muster run` read files, so write what the file holds: {form}"
+                )
+            _check_size(str(value.get("file") or name) if isinstance(value, Mapping) else name, value, how)
 
 
 def check_texts(
-    document: Mapping[str, Any],
-    source: str,
-    lines: Mapping[tuple[str | int, ...], int],
-    store: Place = lambda: None,
-    note: Note | None = None,
+    document: Mapping[str, Any], source: str, lines: Lines, store: Place = lambda: None, note: Note | None = None
 ) -> None:
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
-    for section, field, value, how in _fields(document):
-        try:
-            _check_text(value, field, _Checked(how, _whole(section, document[section], None), store, note))
-        except SpecError as error:
-            raise SpecError(f"{place_of((section, 'config', field), source, lines)}{error}") from None
-
-
-def _check_again(
-    document: Mapping[str, Any],
-    source: str,
-    lines: Mapping[tuple[str | int, ...], int],
-    task: str | None,
-    base: Mapping[str, Any],
-    store: Place,
-    note: Note | None,
-    text_of: TextOf,
-) -> None:
-    """Check the texts of ``base`` where a section changes what their check depends on. Raises SpecError."""
-    for section in ("train", *plugins.evaluating()):
-        values = document.get(section)
-        if not isinstance(values, Mapping):
-            continue
-        config, name = values.get("config") or {}, values.get("task", task)
-        if not isinstance(config, Mapping):
-            continue
-        whole = _whole(section, values, base)
-        for field, how in kept_files(task_config(name) if isinstance(name, str) else None).items():
-            changed = [key for key in how.given if whole.get(key) != base.get(key)]
-            if field in config or not changed:
-                continue
-            try:
-                _check_text(_with_text(base.get(field), field, text_of, note), field, _Checked(how, whole, store, note))
-            except SpecError as error:
-                raise SpecError(f"{place_of((section, 'config', changed[0]), source, lines)}{error}") from None
-
-
-def _with_text(value: Any, field: str, text_of: TextOf, note: Note | None) -> Any:
-    """A field with its text in the place of its digest, where that is to be had."""
-    if not is_reference(value):
-        return value
-    name = value.get("file", field)
-    if (text := text_of(value["sha256"])) is not None:
-        return {"file": name, "text": text}
-    if note is not None:
-        note(f"{name}: its text is not in the run: it is not tried here, but on the job's nodes")
-    return value
-
-
-def _whole(section: str, values: Mapping[str, Any], base: Mapping[str, Any] | None) -> Mapping[str, Any]:
-    """The configuration of a section, as far as it is known."""
-    rules = plugins.rules_of(section)
-    changes = rules.changes(values) if rules else values.get("config") or {}
-    return {**(base or {}), **changes}
-
-
-def _check_text(value: Any, field: str, checked: _Checked) -> None:
-    """Raises SpecError."""
-    text = value.get("text") if isinstance(value, Mapping) else None
-    if checked.how.form == "text" and isinstance(text, str):
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "text"
-            path.write_text(text, encoding="utf-8")
-            _check(str(path), checked, str(value.get("file") or field))
-
-
-def _fields(document: Mapping[str, Any], task: str | None = None) -> Iterator[tuple[str, str, Any, KeptFile]]:
-    """Section, name and value of the given fields that may name a file; of a task that is installed."""
-    for section in ("train", *plugins.evaluating()):
-        values = document.get(section)
-        config = values.get("config") if isinstance(values, Mapping) else None
-        if not isinstance(values, Mapping) or not isinstance(config, Mapping):
-            continue
-        name = values.get("task", task)
-        kind = task_config(name) if isinstance(name, str) else None
-        for field, how in kept_files(kind).items():
-            if field in config:
-                yield section, field, config[field], how
+    origin = _Origin(source, lines, store=store, note=note)
+    for section, name, value, how in origin.given(document):
+        with origin.at(section, name):
+            origin.check_text(value, name, how, origin.whole(section, document[section]))
 
 
 def changes_with_files(
@@ -202,17 +212,17 @@ def changes_with_files(
     Raises:
         SpecError: As :func:`with_files`.
     """
-    given = list(changes or ())
-    if not any(each.startswith(("train.config", "train=")) for each in given):
-        return given
+    assignments = list(changes or ())
+    if not any(each.startswith(("train.config", "train=")) for each in assignments):
+        return assignments
     trained = (spec_of_run() or {}).get("train") or {}
     before = trained.get("config") or {}
-    changed = override({"train": {"task": trained.get("task"), "config": before}}, given)
+    changed = override({"train": {"task": trained.get("task"), "config": before}}, assignments)
     task, config = (setting_at(changed, key) for key in ("train.task", "train.config"))
     if isinstance(config, Mapping) and isinstance(task, str):
-        new = {field: value for field, value in config.items() if value != before.get(field)}
-        _check_again({"train": {"config": new}}, "--set", {}, task, before, store, note, text_of)
-    return [_embedded(each, task, config, keep, store, note) for each in given]
+        new = {name: value for name, value in config.items() if value != before.get(name)}
+        _Origin("--set", {}, task, before, store, note, text_of).check_again({"train": {"config": new}})
+    return [_embedded(each, task, config, keep, store, note) for each in assignments]
 
 
 def _embedded(
@@ -237,17 +247,7 @@ def _embedded(
     return f"{key}={text}"
 
 
-@dataclass(frozen=True)
-class _Checked:
-    """How a file is checked, with the configuration in which it stands; the other attributes as of :func:`with_files`."""
-
-    how: KeptFile
-    config: Mapping[str, Any]
-    store: Place
-    note: Note | None
-
-
-def _content(path: str, how: KeptFile, checked: _Checked) -> Any:
+def _content(path: str, how: KeptFile) -> Any:
     """The value in the configuration. Raises SpecError."""
     try:
         with Path(path).open("rb") as stream:
@@ -266,9 +266,8 @@ def _content(path: str, how: KeptFile, checked: _Checked) -> Any:
             where = f":{error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
             raise SpecError(f"{path}{where}: it is not JSON ({getattr(error, 'msg', 'nested too deeply')})") from None
         if isinstance(value, str):
-            raise SpecError(f"{path}: it holds a text alone")
+            raise SpecError(f"{path}: expected a list or a mapping, found a text")
     _check_size(path, value, how)
-    _check(path, checked)
     return value
 
 
@@ -281,22 +280,3 @@ def _check_size(name: str, value: Any, how: KeptFile) -> None:
     elif (size := size_in_definition(value)) > IN_DEFINITION:
         words = f"it takes {size:,} bytes of the job's definition, and may take {IN_DEFINITION:,}"
         raise SpecError(f"{name}: {words}; shorten it")
-
-
-def _check(path: str, checked: _Checked, name: str = "") -> None:
-    """Have another process check the file, since the parts of tasks belong to the worker. Raises SpecError, in which ``name`` stands for the path."""
-    how, note = checked.how, checked.note
-    if not how.check or any(find_spec(each) is None for each in how.needs):
-        return
-    command = [sys.executable, "-P", "-m", how.check, path]
-    if how.given:
-        given = {field: checked.config[field] for field in how.given if field in checked.config}
-        command += ["--config", json.dumps(given)]
-        command += ["--store", store] if (store := checked.store()) is not None else []
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
-    said = [line.replace(path, name or path, 1) for line in answer.stderr.strip().splitlines()]
-    if answer.returncode:
-        raise SpecError(said[-1] if said else f"{how.check} ended with exit code {answer.returncode}")
-    if note is not None:
-        for line in said:
-            note(line)

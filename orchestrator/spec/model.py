@@ -102,7 +102,7 @@ class _Train(Section):
         written: dict[str, Any] = write(self)
         return {name: value for name, value in written.items() if name not in others}
 
-    def given(self) -> dict[str, Any]:
+    def overrides(self) -> dict[str, Any]:
         """The algorithm's settings that the job gives."""
         if self.section == "settings":
             return self.settings
@@ -210,35 +210,25 @@ class _Spec(Section):
     @classmethod
     def _no_second_kind(cls, document: Any) -> Any:
         """Checked first: other errors in a section that should not exist help nobody."""
-        given = [kind for kind in KINDS if document.get(kind) is not None] if isinstance(document, Mapping) else []
-        if len(given) > 1:
-            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found {' and '.join(given)}")
+        names = [kind for kind in KINDS if document.get(kind) is not None] if isinstance(document, Mapping) else []
+        if len(names) > 1:
+            raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found {' and '.join(names)}")
         return document
 
     @model_validator(mode="after")
-    def _one_kind(self) -> _Spec:
-        given = [kind for kind in KINDS if getattr(self, kind) is not None]
-        if not given:
+    def _is_consistent(self) -> _Spec:
+        names = [kind for kind in KINDS if getattr(self, kind) is not None]
+        if not names:
             raise ValueError(f"expected exactly one of {', '.join(KINDS)}; found none")
         if self.evaluation is not None and self.train is None:
-            raise ValueError(f"evaluation is for jobs that train, not for {given[0]}")
-        if given[0] in plugins.sections() and (self.nodes.max > 1 or self.resources.gpus > 1):
-            raise ValueError(f"{given[0]}: it runs on one node with at most one GPU")
-        return self
-
-    @model_validator(mode="after")
-    def _given_once(self) -> _Spec:
+            raise ValueError(f"evaluation is for jobs that train, not for {names[0]}")
+        if names[0] in plugins.sections() and (self.nodes.max > 1 or self.resources.gpus > 1):
+            raise ValueError(f"{names[0]}: it runs on one node with at most one GPU")
         if both := sorted(self.secrets.keys() & self.environment.keys()):
             raise ValueError(f"secrets: {both[0]} is in environment, too; give it once")
-        return self
-
-    @model_validator(mode="after")
-    def _trackable(self) -> _Spec:
-        if self.track is None:
-            return self
-        if self.train is None:
+        if self.track is not None and self.train is None:
             raise ValueError(f"track: only a training has metrics to track; this job has {self.kind}")
-        if key := key_in(self.environment):
+        if self.track is not None and (key := key_in(self.environment)):
             raise ValueError(
                 f"environment.{key}: the key would be stored in the run; remove it, and give it as a secret: "
                 f"secrets: {{{key}: NAME}}"
@@ -278,7 +268,9 @@ def _section_model(section: plugins.JobSection) -> type[OfCheckpoint]:
     """The model of a plug-in's section. Raises PluginError: it can't be imported, or its key is there already."""
     model: type[OfCheckpoint] = plugins.load(section.model, type)
     if not issubclass(model, OfCheckpoint):
-        raise plugins.failed(section.model, TypeError("it is no orchestrator.spec.sections.OfCheckpoint"))
+        raise plugins.failed(
+            section.model, TypeError("it is not a subclass of orchestrator.spec.sections.OfCheckpoint")
+        )
     if section.key in _Spec.model_fields:
         raise plugins.failed(
             section.model, ValueError(f"{section.key} is a key of every job; choose another for the section")
@@ -358,9 +350,9 @@ def _plain(document: dict[str, Any]) -> tuple[dict[str, Any], list[str]]:
 
 def _of_another_algorithm(train: _Train) -> Problem | None:
     """Settings of an algorithm that is not the chosen one would change nothing."""
-    given = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(train, name)).values())]
-    given += ["settings"] if train.settings else []
-    for name in given:
+    names = [name for name in ALGORITHMS if any(value is not None for value in dict(getattr(train, name)).values())]
+    names += ["settings"] if train.settings else []
+    for name in names:
         if name != train.section:
             words = f"the algorithm is {train.algorithm}, so its settings belong under train.{train.section}"
             return ("train", name), words
@@ -380,7 +372,7 @@ def _problem_of(train: _Train) -> Problem | None:
             path, words = problem
             return ("train", "config", *path), words
         if settings := ALGORITHMS.get(train.algorithm):
-            problem = effective_problem(settings, train.algorithm, kind.configured(train.config), train.given())
+            problem = effective_problem(settings, train.algorithm, kind.configured(train.config), train.overrides())
             if problem:
                 path, words = problem
                 return ("train", train.algorithm, *path), words

@@ -13,7 +13,7 @@ import copy
 import re
 from collections.abc import Mapping
 from dataclasses import fields
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError, create_model
@@ -24,15 +24,8 @@ from shared_store.contract.error_text import explain
 
 def settings_classes() -> dict[str, Any]:
     """The settings class of each installed algorithm, by its name. One that can't be imported is left out: its rank will say why."""
-    found = {}
-    for entry in sorted(entry_points(group="muster.settings"), key=lambda entry: entry.name):
-        try:
-            loaded = entry.load()
-        except Exception:
-            continue
-        if isinstance(loaded, type) and is_pydantic_dataclass(loaded):
-            found[entry.name] = loaded
-    return found
+    found = {entry.name: _loaded(entry) for entry in entry_points(group="muster.settings")}
+    return {name: found[name] for name in sorted(found) if is_pydantic_dataclass(found[name])}
 
 
 def task_config(task: str) -> Any | None:
@@ -40,18 +33,20 @@ def task_config(task: str) -> Any | None:
 
     None of a task that names none, that is not installed (``module:Class``), or whose class can't be imported: its rank checks.
     """
-    for entry in entry_points(group="muster.task_settings", name=task):
-        try:
-            loaded = entry.load()
-        except Exception:
-            continue
-        if hasattr(loaded, "problem_with"):
-            return loaded
-    return None
+    found = map(_loaded, entry_points(group="muster.task_settings", name=task))
+    return next((each for each in found if hasattr(each, "problem_with")), None)
+
+
+def _loaded(entry: EntryPoint) -> Any:
+    """What an entry point names; None where that can't be imported."""
+    try:
+        return entry.load()
+    except Exception:
+        return None
 
 
 def effective_problem(
-    settings: Any, name: str, config: Any, given: Mapping[str, Any]
+    settings: Any, name: str, config: Any, overrides: Mapping[str, Any]
 ) -> tuple[tuple[str | int, ...], str] | None:
     """The first problem of an algorithm's settings as its rank puts them together; None where there is none.
 
@@ -59,7 +54,7 @@ def effective_problem(
         settings: Class of the settings.
         name: Of the algorithm.
         config: The task's configuration, whose field of that name has the task's own settings.
-        given: By the job, in place of the task's.
+        overrides: By the job, in place of the task's.
 
     Returns:
         Keys to the value, and one line.
@@ -67,7 +62,7 @@ def effective_problem(
     own = getattr(config, name, None)
     base = {item.name: getattr(own, item.name) for item in fields(own) if item.init} if own is not None else {}
     try:
-        made = settings(**{**base, **given})
+        made = settings(**{**base, **overrides})
         if hasattr(made, "check_observations"):
             made.check_observations(config.observation_groups)
         if hasattr(made, "check_actions"):

@@ -11,12 +11,10 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict
 
 from orchestrator.domain.errors import SpecError
 from orchestrator.domain.excerpts import excerpt
+from orchestrator.domain.units import BYTES, SECONDS, amount
 from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import shown, unknown_task
 from shared_store.volume.layout import NAME
-
-_UNITS = {"s": 1, "m": 60, "h": 3600, "d": 86400}
-_BYTES = {"KiB": 2**10, "MiB": 2**20, "GiB": 2**30, "TiB": 2**40, "KB": 10**3, "MB": 10**6, "GB": 10**9, "TB": 10**12}
 
 
 class Section(BaseModel):
@@ -25,14 +23,19 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-def _duration(value: object) -> object:
-    """``90s``, ``45m``, ``2h``, ``1d`` or a number of seconds → seconds."""
-    if isinstance(value, str):
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([smhd])", value.strip())
-        if not match:
-            raise ValueError("expected a duration such as 90s, 45m, 2h or 1d")
-        return float(match[1]) * _UNITS[match[2]]
-    return value
+_DURATION = "a duration such as 90s, 45m, 2h or 1d"
+
+
+def _amount(units: Mapping[str, int], expected: str, unit: int | None = None) -> BeforeValidator:
+    """Reads a text as an amount, in whole multiples of ``unit`` where that is given; numbers stay."""
+
+    def read(value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        found = amount(value, units, expected)
+        return found if unit is None else int(found / unit)
+
+    return BeforeValidator(read)
 
 
 def seconds_of(option: str, text: str | None) -> float | None:
@@ -40,41 +43,18 @@ def seconds_of(option: str, text: str | None) -> float | None:
     if text is None:
         return None
     try:
-        return float(str(_duration(text)))
+        return amount(text, SECONDS, _DURATION)
     except ValueError as error:
         raise SpecError(f"{option} {text}: {error}") from None
 
 
-def _mebibytes(value: object) -> object:
-    """``512MiB``, ``4GiB`` or a number of MiB → whole MiB."""
-    if isinstance(value, str):
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
-        if not match:
-            raise ValueError("expected an amount of memory such as 512MiB or 4GiB")
-        return int(float(match[1]) * _BYTES[match[2]] / 2**20)
-    return value
+def _name(pattern: re.Pattern[str], signs: str, most: int) -> AfterValidator:
+    def check(value: str) -> str:
+        if not pattern.fullmatch(value):
+            raise ValueError(f"expected letters, digits, {signs}, starting with a letter or digit, at most {most}")
+        return value
 
-
-def _bytes(value: object) -> object:
-    """``64MiB``, ``1GiB`` or a number of bytes → whole bytes."""
-    if isinstance(value, str):
-        match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]i?B)", value.strip())
-        if not match:
-            raise ValueError("expected a size such as 64MiB or 1GiB")
-        return int(float(match[1]) * _BYTES[match[2]])
-    return value
-
-
-def _run_name(value: str) -> str:
-    if not NAME.fullmatch(value):
-        raise ValueError("expected letters, digits, '.', '_' and '-', starting with a letter or digit, at most 128")
-    return value
-
-
-def _job_name(value: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}", value):
-        raise ValueError("expected letters, digits, '_' and '-', starting with a letter or digit, at most 100")
-    return value
+    return AfterValidator(check)
 
 
 def task_name(value: str) -> str:
@@ -117,11 +97,11 @@ def known_tasks() -> list[str]:
     return sorted({entry.name for entry in entry_points(group="muster.tasks")})
 
 
-Duration = Annotated[float, BeforeValidator(_duration)]
-Memory = Annotated[int, BeforeValidator(_mebibytes)]
-Size = Annotated[int, BeforeValidator(_bytes)]
-RunName = Annotated[str, AfterValidator(_run_name)]
-JobName = Annotated[str, AfterValidator(_job_name)]
+Duration = Annotated[float, _amount(SECONDS, _DURATION)]
+Memory = Annotated[int, _amount(BYTES, "an amount of memory such as 512MiB or 4GiB", 2**20)]
+Size = Annotated[int, _amount(BYTES, "a size such as 64MiB or 1GiB", 1)]
+RunName = Annotated[str, _name(NAME, "'.', '_' and '-'", 128)]
+JobName = Annotated[str, _name(re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}"), "'_' and '-'", 100)]
 TaskName = Annotated[str, AfterValidator(task_name)]
 Environment = Annotated[dict[str, str], AfterValidator(_environment)]
 Secrets = Annotated[dict[str, str], AfterValidator(_secrets)]

@@ -125,5 +125,5 @@ def call(
         response = with_teacher(controller, submit) if is_submission else with_store(controller, carry_out)
     except IntegrityError as error:  # two calls at the same instant
         raise ClientError(f"{operation}: the database refuses it ({str(error.orig).splitlines()[0][:200]})") from None
-    controller.alarm.ring()
+    controller.work_queue.alarm.set()
     return response

@@ -55,7 +55,7 @@ class Access:
     def look_again(self) -> None:
         """Read the keys of the database; the caller's thread may wait for it."""
         if self.keys:
-            self.keys.look_again()
+            self.keys.refresh()
 
     def demanded(self) -> bool:
         """Whether requests must be authenticated. Once keys have existed this stays so: deleting or damaging them opens nothing."""

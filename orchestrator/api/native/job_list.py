@@ -22,7 +22,8 @@ from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import EARLY, WAITING, RunTime, Status
 from orchestrator.domain.reasons import Reason, array_of
 from orchestrator.persistence.batch_models import Job, RunRecord
-from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
+from orchestrator.persistence.job_pages import contains, count, place_of, read_page
+from orchestrator.persistence.keyset import Cursor
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.services.context import queue_names
 from orchestrator.services.damaged_rows import DAMAGED, DamagedRow, reading
@@ -133,8 +134,8 @@ def page_of_jobs(
         "total": sum(counts.get(each, 0) for each in states),
         "counts": counts,
         "areMore": bool(conditions) and sum(counts.values()) == MOST_COUNTED,
-        "next": None if page.is_last or not page.jobs else str(Cursor.of(page.jobs[-1])),
-        "previous": None if page.is_first or not page.jobs else str(Cursor.of(page.jobs[0])),
+        "next": None if page.is_last or not page.jobs else str(place_of(page.jobs[-1])),
+        "previous": None if page.is_first or not page.jobs else str(place_of(page.jobs[0])),
     }
 
 

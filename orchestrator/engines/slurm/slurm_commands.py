@@ -112,7 +112,7 @@ def list_hosts() -> list[Host]:
         cpus = float(fields.get("CPUEfctv") or fields.get("CPUTot", "1"))
         ids = tuple(str(number) for number in range(gpus))
         memory, away = int(fields.get("RealMemory", "0")), bool(state & _AWAY_STATES)
-        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, memory, single=True, away=away))
+        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, memory, single=True, unavailable=away))
     return hosts
 
 

@@ -331,7 +331,7 @@ def test_the_order_of_the_engines_moves_no_job(tmp_path: Path) -> None:
     finally:
         served.close()
     assert served.process.stderr is not None
-    assert "queue default stays with engine local: 1 job in it is not over" in served.process.stderr.read()
+    assert "queue default stays with engine local: 1 job in it has not ended" in served.process.stderr.read()
     with Serving(tmp_path, *served.options) as served:
         assert served.client.get("/api/capacity")["engines"] == {"docker": "default", "local": "local"}
 

@@ -33,7 +33,7 @@ def test_hosts_have_slurm_s_resources_and_drained_ones_are_away(bench: SlurmBenc
     assert found == [(f"slurm/{name}", 4.0, ("0", "1"), 8192, True) for name in NODES]
     bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
     try:
-        assert [host.away for host in SlurmEngine().capacity().machines] == [False, True, False]
+        assert [host.unavailable for host in SlurmEngine().capacity().machines] == [False, True, False]
         handle = bench.launch(bench.gang(nodes=3))
         wait_for(lambda: "nodes that it needs are down" in status_of(bench.engine, handle)[0].words, 20, "it is queued")
         bench.engine.stop(handle, 0.0)
@@ -86,7 +86,7 @@ def test_a_node_that_slurm_would_boot_is_a_host_others_are_away(
 ) -> None:
     line = f"NodeName=n1 CPUTot=4 RealMemory=8192 State={state} Gres=gpu:2\nNodeName=n2 State=FUTURE\n"
     monkeypatch.setattr(slurm_commands, "call", lambda *command: line)
-    assert [(host.name, host.away) for host in list_hosts()] == [("slurm/n1", away)]
+    assert [(host.name, host.unavailable) for host in list_hosts()] == [("slurm/n1", away)]
 
 
 def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -198,7 +198,7 @@ def test_a_node_pushes_into_no_other_s_log_and_makes_none_push(
 ) -> None:
     pushed: list[tuple[Node, int, bytes]] = []
     monkeypatch.setattr(bus, "is_followed", lambda _: True)
-    monkeypatch.setattr(bus, "pushed", lambda *given: pushed.append(given))
+    monkeypatch.setattr(bus, "pushed", lambda *values: pushed.append(values))
     lie, mine = b"2026-01-01T00:00:00.000000Z 0 o forged\n", "muster/mallory/1/0/log"
     for key in (f"{KEY}/log", "muster/*/*/*/log", "muster/victim/1/*/log"):
         proof = push_proof(own(bus), key, 0, lie)

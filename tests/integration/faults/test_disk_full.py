@@ -76,9 +76,9 @@ def test_on_a_full_volume_jobs_are_stopped_settled_and_refused_and_a_flood_does_
         finally:
             server.close()
             copying.wait(10 * PATIENCE)
-    said = (volume.parent / "stderr").read_text()
-    assert "Traceback" not in said and len(said) < 4000, said
-    assert "MB free" in said and "the volumes answer again, and have enough free space" in said
+    message = (volume.parent / "stderr").read_text()
+    assert "Traceback" not in message and len(message) < 4000, message
+    assert "MB free" in message and "the volumes answer again, and have enough free space" in message
     assert not processes_of(server.home)
 
 
@@ -113,8 +113,8 @@ def test_the_database_may_lie_on_another_volume_than_the_home(tmp_path: Path, vo
                 return str(error)
             return ""
 
-        said = wait_for(refusal, 20, "a look at the volume")
-        assert re.search(r"the volume of the database \(.*volume\) has 0 MB free", said), said
+        message = wait_for(refusal, 20, "a look at the volume")
+        assert re.search(r"the volume of the database \(.*volume\) has 0 MB free", message), message
     finally:
         server.close()
 

@@ -78,7 +78,7 @@ def test_hanging_reads_keep_neither_the_loop_nor_a_stop_nor_a_submission_waiting
             for _ in range(10):
                 assert asked(server, "/healthz").status_code == 200
             assert "muster_store_calls{" in asked(server, "/metrics").text
-            assert server.controller.heartbeat.age < 5 and not any(read.done() for read in reads)
+            assert server.controller.monitoring.loop_age < 5 and not any(read.done() for read in reads)
             client.batch("TerminateJob", jobId=job, reason="enough")
             other = submit_gang(client, "pass")
             described = lambda: client.batch("DescribeJobs", jobs=[other])["jobs"][0]["status"]  # noqa: E731
@@ -152,7 +152,7 @@ def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Serv
 
 def test_a_store_whose_volume_is_known_to_be_silent_is_not_even_tried(server: Server) -> None:
     with stalled(server.store.path):
-        wait_for(lambda: server.controller.access.disk.away("store"), 60, "that the volume is silent")
+        wait_for(lambda: server.controller.access.disk.unavailable("store"), 60, "that the volume is silent")
         answer = asked(server, "/api/runs")
         assert answer.status_code == 503 and "has not answered since" in answer.json()["message"]
         assert asked(server, "/api/jobs").status_code == 200
@@ -170,20 +170,24 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
         try:
             if there == "another store":
                 add_run(Store(path).open(), "foreign")
-            said = f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+            message = (
+                f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+            )
             assert asked(server, "/api/runs/taught").status_code == 503, (
                 "what is missing is not taken for deleted meanwhile"
             )
             # the look before may have found the path empty
-            wait_for(lambda: said in (server.controller.access.disk.away("store") or ""), 60, "that it is seen")
+            wait_for(
+                lambda: message in (server.controller.access.disk.unavailable("store") or ""), 60, "that it is seen"
+            )
             answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/models", "/runs/taught")]
             for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
                 body = {"name": "copied"}
                 answers.append(httpx.post(f"{server.url}/api/{asks}", json=body, timeout=60))
             for answer in answers:
-                assert answer.status_code == 503 and said in html.unescape(answer.text), answer.text
+                assert answer.status_code == 503 and message in html.unescape(answer.text), answer.text
             assert [each["id"] for each in asked(server, "/api/jobs").json()["jobs"]] == [job]
-            assert said in asked(server, f"/api/jobs/{job}").json()["storeProblem"]
+            assert message in asked(server, f"/api/jobs/{job}").json()["storeProblem"]
             client.batch("TerminateJob", jobId=job, reason="enough")
         finally:
             path.rename(tmp_path / "wrong") if path.exists() else None

@@ -107,5 +107,5 @@ def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: P
             "digits, found '99999999999999999999999'"
         )
     assert second.process.stderr is not None
-    told = second.process.stderr.read()
-    assert f"the controller of {tmp_path}/a on " in told and "Traceback" not in told
+    reported = second.process.stderr.read()
+    assert f"the controller of {tmp_path}/a on " in reported and "Traceback" not in reported

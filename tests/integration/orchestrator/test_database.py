@@ -266,7 +266,7 @@ def test_a_controller_that_lost_its_database_refuses_writes_alone(postgresql: po
     other.execute(text("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory' AND granted"))
     with httpx.Client(base_url=losing.url, timeout=60) as client:
         try:
-            wait_for(lambda: losing.controller.reconciler.trouble, 30, "that it notices")
+            wait_for(lambda: losing.controller.trouble, 30, "that it notices")
             for operation, request in (
                 ("canceljob", {"jobId": "x", "reason": "x"}),
                 ("submitjob", {"jobName": "x", "jobQueue": "default", "jobDefinition": "x"}),

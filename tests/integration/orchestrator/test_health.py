@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.control import heartbeat
+from orchestrator.control import monitoring
 from orchestrator.server import Server
 from orchestrator.service_manager import ServiceManager
 from tests.conftest import Serving, submit_gang, wait_for
@@ -29,7 +29,7 @@ def test_a_loop_that_is_stuck_makes_the_health_check_fail(inside: Server, monkey
         assert "the controller's loop has made no progress for" in health().json()["message"]
         metrics = httpx.get(f"{inside.url}/metrics", timeout=30).text
         age = next(line for line in metrics.splitlines() if line.startswith("muster_loop_age_seconds "))
-        assert float(age.split()[1]) > heartbeat.LATE
+        assert float(age.split()[1]) > monitoring.LATE
     finally:
         gate.set()
     wait_for(lambda: health().status_code == 200, 60, "that it goes on")

@@ -273,9 +273,9 @@ def test_what_another_controller_changed_meanwhile_counts_once_the_database_is_b
     for name in ("a", "b"):
         bench.wait(name, Status.RUNNING)
     database = bench.controller.database
-    bench.controller.reconciler._kept = 0.0
+    bench.controller._kept = 0.0
     with mock.patch.object(database, "keep_lock", side_effect=DatabaseError("another controller has it")):
-        wait_for(lambda: bench.controller.reconciler.trouble, 20, "that the lock is missed")
+        wait_for(lambda: bench.controller.trouble, 20, "that the lock is missed")
         with database.engine.begin() as other:  # as the other controller does: this one is not told
             other.execute(update(Job).where(Job.id == "a").values(stop_reason="enough"))
             moment = {"stopped_at": 1, "ending": "stopped", "spent": True}

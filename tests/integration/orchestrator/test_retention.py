@@ -127,7 +127,7 @@ def test_rules_are_checked_where_they_are_set(server: Serving) -> None:
         2,
         "older_than: 'off': expected days, hours or minutes, such as 90d, 36h or 45m",
     )
-    with pytest.raises(ApiError, match="is no place of a pass"):
+    with pytest.raises(ApiError, match="is not a place in the list of jobs"):
         server.client.get("/api/gc", after="nowhere")
     queue = "arn:aws:batch:us-east-1:000000000000:job-queue/default"
 

@@ -212,7 +212,7 @@ def test_messages_of_an_unknown_webhook_wait_for_a_controller_that_is_not_a_comm
     server.close()
     for file, problem in (
         (None, None),
-        (write_webhooks(tmp_path / "hooks.json", other=here), "no webhook is called so"),
+        (write_webhooks(tmp_path / "hooks.json", other=here), "the webhook was removed from the configuration"),
     ):
         server = Server(home, cpus=1, webhooks=file, temporary=file is None)
         server.start()

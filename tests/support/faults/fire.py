@@ -63,12 +63,14 @@ def write_spec(path: Path, nodes: int, attempts: int, iterations: int, keep: int
 def run_straight(home: Home, nodes: int, iterations: int, steps: int = 16) -> Reference:
     """The reference: the same job, undisturbed; every checkpoint is kept."""
     spec = write_spec(home.path / f"straight-{nodes}.yaml", nodes, 1, iterations, 10_000, steps)
-    submitted, said = home.command("submit", str(spec))
+    submitted, output = home.command("submit", str(spec))
     if submitted is None:
-        raise Broken(f"submit: {said}")
+        raise Broken(f"submit: {output}")
     run = f"torture-{submitted['jobId'][:8]}"
-    deadline = time.monotonic() + HANG_SECONDS
+    iteration, deadline = 0, time.monotonic() + HANG_SECONDS
     while (job := home.jobs(run)[-1])["status"] != "SUCCEEDED":
+        if (now := reached(home.run(run), 1)) != iteration:  # on a busy machine it may take long, as long as it moves
+            iteration, deadline = now, time.monotonic() + HANG_SECONDS
         if job["status"] == "FAILED" or time.monotonic() > deadline:
             raise Broken(f"the straight run is {job['status']}: {job['status_reason']}")
         time.sleep(0.2)

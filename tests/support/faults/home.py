@@ -55,13 +55,13 @@ class Home:
         """Start the controller; returns at once."""
         assert not self.up
         self.starts += 1
-        with open(self._said, "wb") as said, open(self.errors, "ab") as errors:
+        with open(self._said, "wb") as message, open(self.errors, "ab") as errors:
             self.process = subprocess.Popen(
                 [MUSTER, "serve", "--port", "0", "--cpus", "16", *self.options],
                 env={**os.environ, "MUSTER_HOME": str(self.path), **self.env},
                 cwd=REPOSITORY,
                 stdin=subprocess.DEVNULL,
-                stdout=said,
+                stdout=message,
                 stderr=errors,
             )
 

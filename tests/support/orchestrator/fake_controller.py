@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -27,8 +28,10 @@ E = TypeVar("E", bound=FakeEngine)
 def properties(cpus: int, nodes: int = 1, **variables: str) -> dict[str, Any]:
     """Of a native job; ``cpus`` of each node."""
     needs = [{"type": "VCPU", "value": str(cpus)}]
-    given = [{"name": name, "value": value} for name, value in {"MUSTER_ON_CHILD_FAILURE": "fail", **variables}.items()]
-    container = {"command": ["true"], "resourceRequirements": needs, "environment": given}
+    values = [
+        {"name": name, "value": value} for name, value in {"MUSTER_ON_CHILD_FAILURE": "fail", **variables}.items()
+    ]
+    container = {"command": ["true"], "resourceRequirements": needs, "environment": values}
     return {"numNodes": nodes, "mainNode": 0, "nodeRangeProperties": [{"targetNodes": "0:", "container": container}]}
 
 
@@ -49,15 +52,13 @@ class FakeController(Generic[E]):
             session.add(JobQueue(name="urgent", priority=9, compute_environments=["fake"]))
         peers = Peers(self.store, home)
         runs = store_type(self.store, peers)
-        self.controller = Controller.assemble(
-            self.database, engines, self.store, Bus(home, {}), peers, interval=0.02, runs=runs
-        )
+        self.controller = Controller(self.database, engines, self.store, Bus(home, {}), peers, interval=0.02, runs=runs)
         stack.callback(self.controller.close)
 
     def submit(self, *names: str, **facts: Any) -> None:
         with self.database.session() as session:
             session.add_all(job(name, status=Status.RUNNABLE, **facts) for name in names)
-        self.controller.alarm.ring()
+        self.controller.work_queue.alarm.set()
 
     def job(self, name: str) -> Job:
         with self.database.session() as session:
@@ -66,6 +67,15 @@ class FakeController(Generic[E]):
     def wait(self, name: str, *wanted: Status) -> Job:
         found: Job = wait_for(lambda: (j := self.job(name)).status in wanted and j, 30, f"{name} is {wanted}")
         return found
+
+    def ticks(self, condition: Callable[[], bool]) -> None:
+        """Make passes until the condition holds."""
+
+        def holds() -> bool:
+            self.controller.tick()
+            return condition()
+
+        wait_for(holds, 30, "the state")
 
     def explains(self, name: str, said: str) -> None:
         """Wait until a job's reason, as every answer shows it, has these words."""

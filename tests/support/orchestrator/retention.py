@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sqlalchemy import func, select, update
 
+from orchestrator.control.disk import Disk
 from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention
-from orchestrator.control.retention_looks import CONTROLLER, PassCursor, Step, Whose
-from orchestrator.control.run_users import RunUsers
+from orchestrator.control.retention_facts import CONTROLLER, Requester, Step
+from orchestrator.control.store_access import StoreAccess
 from orchestrator.domain.retention import A_DAY, BATCH_DAYS
 from orchestrator.persistence.batch_models import Attempt, Base, Dependency, Job, Node, RunRecord, now
+from orchestrator.persistence.keyset import Cursor
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.session import Database
 from shared_store.volume.files import write_json
@@ -32,30 +33,18 @@ class World:
     def __init__(self, home: Path) -> None:
         self.database = Database(f"sqlite:///{home}/muster.db")
         self.store = Store(home / "store").open()
-        self.peers = Peers(self.store, home)
-        self.users, self.writing = RunUsers(), threading.Lock()
-        self.beginning: dict[str, object] = {}
-        self.absent: Callable[[], None] = lambda: None
+        self.access: Any = StoreAccess(self.store, Peers(self.store, home), Disk({}))
+        self.users, self.writing, self.beginning = self.access.users, threading.Lock(), self.access.beginning
 
     def retention(self, default: float | None = None) -> Retention:
-        return Retention(
-            self.database,
-            self.store,
-            self.peers,
-            self.users,
-            self.beginning,
-            self.writing,
-            lambda: self.absent(),
-            now,
-            default,
-        )
+        return Retention(self.database, self.access, self.writing, now, default)
 
     def step(
-        self, after: PassCursor = PassCursor(), *, take: bool, whose: Whose = CONTROLLER, most: int = 100, **rules: Any
+        self, after: Cursor = Cursor(), *, take: bool, by: Requester = CONTROLLER, most: int = 100, **rules: Any
     ) -> Step:
         """A step, with other rules."""
         retention = self.retention()
-        return retention.step(after, replace(retention.rules(), **rules), take=take, whose=whose, most=most)
+        return retention.step(after, replace(retention.rules(), **rules), take=take, by=by, most=most)
 
     def reasons(self) -> dict[str, str]:
         """Of each run that is kept, why."""

@@ -72,12 +72,12 @@ def main() -> int:
     parser.add_argument("--jobs", type=_numbers, default=list(JOBS), help="numbers of the jobs that take part")
     parser.add_argument("--faults", type=_numbers, default=list(FAULTS), help="numbers of the faults that happen")
     parser.add_argument("--mutant", choices=MUTANTS, help="a fault of the controller to be found")
-    asked = parser.parse_args()
-    if asked.end is not None:
-        failed = _many(asked.seed, asked.end, asked.mutant)
-        return int(bool(failed) != bool(asked.mutant))
-    with MUTANTS[asked.mutant]() if asked.mutant else nullcontext():
-        return _one(asked.seed, asked.jobs, asked.faults)
+    requested = parser.parse_args()
+    if requested.end is not None:
+        failed = _many(requested.seed, requested.end, requested.mutant)
+        return int(bool(failed) != bool(requested.mutant))
+    with MUTANTS[requested.mutant]() if requested.mutant else nullcontext():
+        return _one(requested.seed, requested.jobs, requested.faults)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from orchestrator.control.observer import Observer
 from orchestrator.control.presence import Presence
 from orchestrator.control.run_store import Errands, RunStore
 from orchestrator.domain import attempt as rules
-from orchestrator.domain.attempt_events import Due, Event, LaunchDelayed, Launched, Observed, Silence
+from orchestrator.domain.attempt_events import Delayed, Due, Event, Launched, Observed, Silence
 from orchestrator.domain.attempt_instructions import Explain, Instructions, Launch
 from orchestrator.domain.job import NodeEnd
 from orchestrator.engines.api import Cause, NodeStatus
@@ -26,7 +26,7 @@ Mutant = AbstractContextManager[Any]
 def silence_alone_counts() -> Mutant:
     """B1: a node counts as dead when it is silent for 20 s, whatever its engine says, and however many others are."""
 
-    def silence(self: Presence, node: Node, asked: float | None, runs: bool = True) -> Silence | None:
+    def silence(self: Presence, node: Node, requested: float | None, runs: bool = True) -> Silence | None:
         heard = self._nodes.get(node)
         if heard is None or heard.gone is None:
             return None
@@ -80,7 +80,7 @@ def what_is_to_end_is_launched() -> Mutant:
         if state.phase is rules.AttemptPhase.LAUNCHING and state.verdict is not None:
             if isinstance(event, Due):
                 return (Launch(),)
-            if isinstance(event, LaunchDelayed):
+            if isinstance(event, Delayed):
                 return (Explain(event.reason),) if event.reason else ()
         return step(state, event)
 

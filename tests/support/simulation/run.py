@@ -106,7 +106,7 @@ class Simulation:
         while self.machine.time < end:
             self.machine.step()
             controller, soon = self._controller, self.machine.time + _SOON
-            if controller is not None and controller.alarm.rings and self._next_tick > soon:
+            if controller is not None and controller.work_queue.alarm.is_set() and self._next_tick > soon:
                 self._tick_at(soon)
             if all(job.final for job in self.jobs):
                 return
@@ -121,7 +121,7 @@ class Simulation:
         try:
             runs = SimulatedRunStore(self)
             self._bus = SimulatedBus(self)
-            self._controller = Controller.assemble(
+            self._controller = Controller(
                 SimulatedDatabase(self.memory, self),
                 EngineSet([SimulatedEngine(self)]),
                 runs.store,
@@ -149,10 +149,10 @@ class Simulation:
         if process != self.machine.process or due != self._next_tick or controller is None or self._bus is None:
             return
         self._bus.listen()
-        controller.alarm.clear()
+        controller.work_queue.alarm.clear()
         self.in_loop = True
         try:
-            controller.reconciler._isolation.part("reconciling", controller.reconciler.tick)
+            controller._isolation.part("reconciling", controller.tick)
         except Crash:
             self.die()
             return
@@ -231,7 +231,7 @@ class Simulation:
                 session.add(job.row())
             return {}
 
-        if self._controller is not None and self._controller.reconciler.trouble is None:
+        if self._controller is not None and self._controller.trouble is None:
             try:
                 self._controller.writes.gather(body)
                 job.acknowledged = True

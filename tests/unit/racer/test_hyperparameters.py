@@ -37,7 +37,7 @@ def refused(hyperparameters: Any, task: str = "Racer", **train: Any) -> str:
 def test_a_usual_file_becomes_settings_of_ppo() -> None:
     spec = job(USUAL)
     assert spec.train is not None
-    assert spec.train.given() == {
+    assert spec.train.overrides() == {
         **{"epochs": 5, "learning_rate": 0.0003, "schedule": "fixed", "gamma": 0.99, "entropy_coef": 0.01},
         # 20 episodes of 200 steps are 4,000 steps, 31.25 of each of 128 cars: 32, in eights
         "steps": 32,
@@ -57,7 +57,7 @@ def test_a_usual_file_becomes_settings_of_sac() -> None:
     spec = job(USUAL, algorithm="sac")
     assert spec.train is not None
     rates = dict.fromkeys(("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate"), 0.0003)
-    assert spec.train.given() == {"batch_size": 64, "gamma": 0.99, "init_temperature": 0.2, **rates}
+    assert spec.train.overrides() == {"batch_size": 64, "gamma": 0.99, "init_temperature": 0.2, **rates}
 
 
 OF_SAC = {
@@ -71,7 +71,7 @@ def test_a_file_of_sac_is_taken_and_noted_where_ppo_trains() -> None:
     spec = job({**OF_SAC, "e_greedy_value": 0.05, "stack_size": 1, "pretrained": "false"}, algorithm="sac")
     rates = dict.fromkeys(("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate"), 0.0003)
     assert spec.train is not None
-    assert spec.train.given() == {"batch_size": 64, "gamma": 0.999, "init_temperature": 0.2, **rates}
+    assert spec.train.overrides() == {"batch_size": 64, "gamma": 0.999, "init_temperature": 0.2, **rates}
     assert [note for note in spec.notes if "exploration_type" in note] == []
     assert "hyperparameters.pretrained false: it changes nothing, as on AWS, which does not know it" in spec.notes
     notes = job(OF_SAC).notes
@@ -92,7 +92,7 @@ def test_an_iteration_is_about_as_long_as_that_many_episodes(
     worlds: int, episodes: int, batch: int, steps: int, minibatches: int
 ) -> None:
     spec = job({"batch_size": batch, "num_episodes_between_training": episodes}, worlds=worlds)
-    assert spec.train is not None and spec.train.given() == {"steps": steps, "minibatches": minibatches}
+    assert spec.train is not None and spec.train.overrides() == {"steps": steps, "minibatches": minibatches}
 
 
 def test_a_stack_is_the_frames_of_the_camera() -> None:
@@ -133,7 +133,7 @@ def test_a_hyperparameter_that_is_also_a_setting_is_refused() -> None:
     )
     spec = job({"lr": 1e-4}, ppo={"clip": 0.1})
     assert spec.train is not None
-    assert spec.train.given() == {"clip": 0.1, "learning_rate": 1e-4, "schedule": "fixed"}
+    assert spec.train.overrides() == {"clip": 0.1, "learning_rate": 1e-4, "schedule": "fixed"}
 
 
 def test_tasks_and_algorithms_without_hyperparameters_refuse_them() -> None:
@@ -147,7 +147,7 @@ def test_a_file_of_hyperparameters_is_read_at_the_submission_and_not_needed_agai
     file.write_text(json.dumps({"lr": "0.0002", "loss_type": "mean_squared_error"}))
     yaml.write_text(f"name: racer\ntrain:\n  task: Racer\n  worlds: 8\n  iterations: 1\n  hyperparameters: {file}\n")
     spec = load(str(yaml))
-    assert spec.train is not None and spec.train.given() == {"learning_rate": 0.0002, "schedule": "fixed"}
+    assert spec.train is not None and spec.train.overrides() == {"learning_rate": 0.0002, "schedule": "fixed"}
     assert spec.notes == ()
     assert "hyperparameters" not in json.dumps(compile_definition(spec, "/"))
     assert "hyperparameters" in schema()["$defs"]["Train"]["properties"]

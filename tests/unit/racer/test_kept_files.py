@@ -45,7 +45,7 @@ def directory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def unchecked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are read, and not tried: that takes a process each."""
-    monkeypatch.setattr(kept_files, "_check", lambda *_: None)
+    monkeypatch.setattr(kept_files._Origin, "check", lambda *_: None)
 
 
 def config(changes: list[str] | None = None) -> dict[str, Any]:
@@ -161,7 +161,7 @@ def test_a_digest_stands_for_a_text_and_never_beside_one() -> None:
     [
         (b"{\n 1", r"space\.json:2: it is not JSON \(Expecting property name"),
         (b"\xff\xfe", r"space\.json: it is not a text file \(UTF-8\)"),
-        (b'"other.json"', r"space\.json: it holds a text alone"),
+        (b'"other.json"', r"space\.json: expected a list or a mapping, found a text"),
         (
             b'{"action_space": [{"steering_angle": 0, "speed": "fast"}, {}]}',
             r"action_space\.action_space\.0\.speed: expected a number",

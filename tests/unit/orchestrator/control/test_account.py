@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,13 +14,6 @@ from orchestrator.persistence.own_models import LogGroup
 from orchestrator.persistence.session import Database
 from orchestrator.services import arns
 from tests.support.orchestrator.rows import job
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    made = Database.at(tmp_path)
-    yield made
-    made.close()
 
 
 def start(database: Database, account: str | None = None, region: str | None = None) -> Account:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from sqlalchemy.orm import Session
 
 from orchestrator.client import Client
 from orchestrator.control.clock import Clock
@@ -51,8 +52,10 @@ def noted(clock: Clock, database: Database) -> None:
     assert not clock.stepped
 
 
-def test_steady_time_begins_as_the_wall_clock_and_passes_over_its_steps_and_the_machine_s_sleep(tmp_path: Path) -> None:
-    machine, database = Machine(), Database.at(tmp_path)
+def test_steady_time_begins_as_the_wall_clock_and_passes_over_its_steps_and_the_machine_s_sleep(
+    database: Database,
+) -> None:
+    machine = Machine()
     clock = begun(machine, database)
     start = clock.now()
     assert start == machine.wall * 1000 and clock.drift == 0 and not clock.stepped
@@ -69,11 +72,10 @@ def test_steady_time_begins_as_the_wall_clock_and_passes_over_its_steps_and_the_
     machine.wall += HOUR
     machine.passes(1)
     noted(begun(machine, database), database)  # while no controller ran
-    database.close()
 
 
-def test_after_another_boot_the_wall_clock_says_how_much_time_has_passed(tmp_path: Path) -> None:
-    machine, database = Machine(), Database.at(tmp_path)
+def test_after_another_boot_the_wall_clock_says_how_much_time_has_passed(database: Database) -> None:
+    machine = Machine()
     clock = begun(machine, database)
     start = clock.now()
     machine.wall += 2 * HOUR
@@ -82,16 +84,12 @@ def test_after_another_boot_the_wall_clock_says_how_much_time_has_passed(tmp_pat
     machine.wall, machine.monotonic, machine.boot = machine.wall + 60, 3.0, "second"
     after = begun(machine, database)
     assert (after.now(), after.drift) == (start + 70_000, clock.drift) and not after.stepped
-    database.close()
 
 
-def test_a_clock_that_is_behind_does_not_multiply_the_use_of_a_share(tmp_path: Path) -> None:
-    database = Database.at(tmp_path)
-    with database.session() as session:
-        session.add(ShareUsage(queue="default", share="red", seconds=100.0, as_of=10**12))
-        session.flush()
-        assert usage_at(session, 10**12 - 86_400_000, {"default": 60}, []) == {("default", "red"): 100.0}
-    database.close()
+def test_a_clock_that_is_behind_does_not_multiply_the_use_of_a_share(session: Session) -> None:
+    session.add(ShareUsage(queue="default", share="red", seconds=100.0, as_of=10**12))
+    session.flush()
+    assert usage_at(session, 10**12 - 86_400_000, {"default": 60}, []) == {("default", "red"): 100.0}
 
 
 def test_a_step_of_the_clock_ends_no_job_even_across_a_restart_of_the_controller(

@@ -20,7 +20,6 @@ from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.testing.fake import FakeEngine
 from tests.support.orchestrator.fake_controller import FakeController, properties
-from tests.support.waiting import wait_for
 
 T = TypeVar("T")
 GANGS = 20
@@ -75,19 +74,9 @@ def bench(tmp_path: Path) -> Iterator[tuple[FakeController[FakeEngine], Costs]]:
         stack.callback(event.remove, Engine, "before_cursor_execute", costs.note)
         made.submit(*(f"job-{number}" for number in range(GANGS - 1)), node_properties=properties(1))
         made.submit("pair", node_properties=properties(1, nodes=2))
-        ticks(made, lambda: made.database.counts.by_status() == {Status.RUNNING: GANGS})
-        ticks(made, lambda: min(made.controller.work_queue._active.values()) > time.monotonic())
+        made.ticks(lambda: made.database.counts.by_status() == {Status.RUNNING: GANGS})
+        made.ticks(lambda: min(made.controller.work_queue._active.values()) > time.monotonic())
         yield made, costs
-
-
-def ticks(bench: FakeController[FakeEngine], condition: Callable[[], bool]) -> None:
-    """Make passes until the condition holds."""
-
-    def there() -> bool:
-        bench.controller.reconciler.tick()
-        return condition()
-
-    wait_for(there, 30, "the state")
 
 
 def test_a_pass_in_which_nothing_changed_reads_and_writes_nothing(
@@ -98,8 +87,8 @@ def test_a_pass_in_which_nothing_changed_reads_and_writes_nothing(
 
     def passes() -> None:
         for _ in range(10):
-            controller.controller.reconciler.tick()
-        ticks(controller, lambda: controller.engine.looks > looks + 2)  # the engine is looked at all the same
+            controller.controller.tick()
+        controller.ticks(lambda: controller.engine.looks > looks + 2)  # the engine is looked at all the same
 
     costs.watched(passes)
     assert (costs.statements, costs.store, costs.files) == ([], [], [])
@@ -112,8 +101,8 @@ def test_a_job_that_waits_costs_nothing_between_two_scheduling_passes(
     controller, costs = bench
     controller.submit("large", node_properties=properties(4))
     passed = controller.controller.admission._passed
-    ticks(controller, lambda: controller.controller.admission._passed[0] > passed[0])
-    costs.watched(controller.controller.reconciler.tick)
+    controller.ticks(lambda: controller.controller.admission._passed[0] > passed[0])
+    costs.watched(controller.controller.tick)
     assert (costs.statements, costs.store, costs.files) == ([], [], [])
 
 
@@ -131,7 +120,7 @@ def test_a_gang_that_ends_costs_looks_at_no_other(
 
     def passes() -> None:
         controller.engine.cluster.end("job-3/1/1", 0, 0)
-        ticks(controller, lambda: controller.database.counts.by_status().get(Status.SUCCEEDED) == 1)
+        controller.ticks(lambda: controller.database.counts.by_status().get(Status.SUCCEEDED) == 1)
 
     costs.watched(passes)
     assert looked == {"job-3"}
@@ -141,12 +130,12 @@ def test_a_gang_that_ends_costs_looks_at_no_other(
 
 def test_an_engine_is_asked_for_all_gangs_at_once(bench: tuple[FakeController[FakeEngine], Costs]) -> None:
     controller, _ = bench
-    asked, observe = list[int](), controller.engine.observe
+    requested, observe = list[int](), controller.engine.observe
 
     def observed(handles: Any) -> Any:
-        asked.append(len(handles))
+        requested.append(len(handles))
         return observe(handles)
 
     controller.engine.observe = observed  # type: ignore[method-assign]
-    ticks(controller, lambda: len(asked) >= 3)
-    assert set(asked) == {GANGS}
+    controller.ticks(lambda: len(requested) >= 3)
+    assert set(requested) == {GANGS}

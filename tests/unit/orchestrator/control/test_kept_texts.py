@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -30,13 +29,6 @@ TEXT = "def reward_function(params):\n    return 1.0\n"
 DIGEST = digest_of(TEXT)
 LONG = {"file": "long.py", "text": TEXT + "#" * (30 << 10)}
 _TRAIN = {"task": "elsewhere.mine:Task", "worlds": 4, "iterations": 1, "config": {"reward_function": LONG}}
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database(f"sqlite:///{tmp_path}/muster.db")
-    yield database
-    database.close()
 
 
 @pytest.fixture
@@ -141,14 +133,14 @@ def test_a_text_of_an_earlier_folder_goes_with_its_row(
 def test_the_look_for_what_nothing_needs_is_made_soon_after_a_start_and_then_rarely(
     texts: KeptTexts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    asked: list[Any] = []
+    requested: list[Any] = []
     for seconds, looks in ((0, 0), (59, 0), (61, 1), (3600, 1), (3662, 2)):
         moment = machine.monotonic() + seconds
         with monkeypatch.context() as patch:
             patch.setattr(machine, "monotonic", lambda moment=moment: moment)
-            texts.sweep_when_due(asked.append)
-            texts.sweep_when_due(asked.append)
-        assert asked == [texts.sweep] * looks, seconds
+            texts.sweep_when_due(requested.append)
+            texts.sweep_when_due(requested.append)
+        assert requested == [texts.sweep] * looks, seconds
 
 
 def test_leftovers_of_a_killed_upload_go_and_other_controllers_texts_stay(texts: KeptTexts, store: Store) -> None:

@@ -16,7 +16,7 @@ from sqlalchemy import select
 
 from orchestrator.control import retention as module
 from orchestrator.control.retention import RunNeeded
-from orchestrator.control.retention_looks import PassCursor, Whose
+from orchestrator.control.retention_facts import Requester
 from orchestrator.control.run_users import RunUsers
 from orchestrator.domain.retention import A_DAY
 from orchestrator.persistence import retention_rows
@@ -29,6 +29,7 @@ from orchestrator.persistence.batch_models import (
     RunRecord,
     now,
 )
+from orchestrator.persistence.keyset import Cursor
 from orchestrator.persistence.own_models import RetentionStart, RunUse, ShareUsage
 from shared_store.volume import contents, trash
 from shared_store.volume.files import sync_directory, write_json
@@ -174,14 +175,14 @@ def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkey
         world.ended(f"j{number:02}", stopped_at=LONG_AGO + number // 5)
         if number % 4 == 0:
             contents.archive(world.store.run(f"j{number:02}"), "key a")
-    place: PassCursor | None = PassCursor()
+    place: Cursor | None = Cursor()
     seen: list[str] = []
     while place is not None:
         looks, place = world.step(place, take=False, most=3)
-        place = None if place is None else PassCursor.of(str(place))
+        place = None if place is None else Cursor.read(str(place))
         seen += [each["run"] for each in looks]
     assert sorted(seen) == [f"j{number:02}" for number in range(17)]
-    place = PassCursor()
+    place = Cursor()
     while place is not None:
         _, place = world.step(place, take=True, most=3)
     assert world.jobs() == world.runs() == [f"j{number:02}" for number in range(0, 17, 4)]
@@ -243,7 +244,7 @@ def test_a_death_at_any_step_leaves_the_run_or_the_trash_and_the_next_pass_ends_
                     assert sorted(os.listdir(run)) == ["logs", "outcomes", "run.json"], "nothing of it is missing"
             else:
                 assert (run / "results.csv").is_file()
-    world.users = RunUsers()  # another process
+    world.access.users = RunUsers()  # another process
     later: list[Callable[[], object]] = []
     following = world.retention()
     following.start(later.append)
@@ -336,7 +337,7 @@ def test_in_the_first_days_after_an_upgrade_it_only_logs(world: World, caplog: p
 
 
 def test_a_key_with_some_queues_takes_only_what_is_its_own(world: World) -> None:
-    mine = Whose("key a", frozenset({"default"}))
+    mine = Requester("key a", frozenset({"default"}))
     world.ended("own")
     world.ended("others", owner="key b")
     world.ended("elsewhere", queue="lab")
@@ -347,7 +348,7 @@ def test_a_key_with_some_queues_takes_only_what_is_its_own(world: World) -> None
     with world.database.session() as session:
         session.get_one(RunRecord, "shared").owner = "key a"
         session.get_one(RunRecord, "of-b").owner = "key b"
-    looks, _ = world.step(take=True, whose=mine)
+    looks, _ = world.step(take=True, by=mine)
     gone = sorted(name for each in looks for name in each["jobs"])
     assert gone == ["own", "shared"]
     assert world.runs() == ["elsewhere", "of-b", "others", "shared"]

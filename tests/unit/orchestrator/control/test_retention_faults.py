@@ -20,7 +20,7 @@ def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
     def away() -> None:
         raise OSError("the volume is not there")
 
-    world.absent = away
+    world.access.check = away
     with pytest.raises(OSError):
         world.retention().take_all()
     assert world.jobs() == ["old"] and world.runs() == ["old"]
@@ -32,7 +32,7 @@ def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
         if checks[0] > 3:
             raise OSError("the volume is not there")
 
-    world.absent = vanishing
+    world.access.check = vanishing
     with pytest.raises(OSError):
         world.retention().take_all()
     assert world.jobs() == ["old"]

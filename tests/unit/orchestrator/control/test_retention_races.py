@@ -160,13 +160,13 @@ def test_what_needs_runs_is_looked_for_again_before_a_run_that_was_cited_can_be_
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     retention, taken = world.retention(), list[bool]()
-    look_again = retention.stored.look_again
+    refresh = retention.stored.refresh
 
     def looked() -> None:
         taken.append(world.users.take("old"))
-        look_again()
+        refresh()
 
-    monkeypatch.setattr(retention.stored, "look_again", looked)
+    monkeypatch.setattr(retention.stored, "refresh", looked)
     controller: Any = SimpleNamespace(retention=retention, access=SimpleNamespace(users=world.users))
     with using(controller, "old"):
         assert not taken

@@ -29,16 +29,6 @@ def bench(tmp_path: Path) -> Iterator[Bench]:
         yield FakeController(tmp_path, FakeEngine(capacity=Hosts([Host("fake/host", 8.0, (), 8192)])), stack)
 
 
-def ticks(bench: Bench, condition: Callable[[], bool]) -> None:
-    """Make passes until the condition holds."""
-
-    def there() -> bool:
-        bench.controller.reconciler.tick()
-        return condition()
-
-    wait_for(there, 30, "the state")
-
-
 def are(bench: Bench, status: Status, *names: str) -> Callable[[], bool]:
     return lambda: all(bench.job(name).status == status for name in names)
 
@@ -51,20 +41,20 @@ def test_what_a_request_changes_of_a_queue_counts_at_the_next_pass(bench: Bench)
 
     bench.submit("waits", queue="urgent", node_properties=properties(10))
     bench.submit("ends", queue="urgent", node_properties=properties(6))
-    ticks(bench, are(bench, Status.RUNNING, "ends"))
+    bench.ticks(are(bench, Status.RUNNING, "ends"))
     bench.engine.cluster.end("ends/1/1", 0, 0)
-    ticks(bench, are(bench, Status.SUCCEEDED, "ends"))  # the loop has read the queue, to charge the share
+    bench.ticks(are(bench, Status.SUCCEEDED, "ends"))  # the loop has read the queue, to charge the share
     with bench.database.session() as session:
         session.get_one(JobQueue, "urgent").compute_environments = []
     bench.engine.offered = Hosts([Host("fake/host", 16.0, (), 16384)])
     bench.controller.engines.capacity(patience=10.0)
     queue.version += 1
-    ticks(bench, pass_of_now)
+    bench.ticks(pass_of_now)
     assert bench.job("waits").status == Status.RUNNABLE
     with bench.database.session() as session:
         session.get_one(JobQueue, "urgent").compute_environments = ["fake"]
     queue.version += 1
-    ticks(bench, are(bench, Status.RUNNING, "waits"))
+    bench.ticks(are(bench, Status.RUNNING, "waits"))
 
 
 def test_jobs_of_one_share_that_end_together_share_their_commits(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,7 +63,7 @@ def test_jobs_of_one_share_that_end_together_share_their_commits(bench: Bench, m
         session.get_one(JobQueue, "urgent").policy = "fair"
     names = ["one", "two", "three"]
     bench.submit(*names, queue="urgent", share="team", node_properties=properties(1))
-    ticks(bench, are(bench, Status.RUNNING, *names))
+    bench.ticks(are(bench, Status.RUNNING, *names))
     jobs, again, depth = Isolation._together, list[Sequence[str]](), [0]
 
     def noted(self: Isolation, what: str, ids: Sequence[str], body: Any) -> Sequence[str]:
@@ -88,7 +78,7 @@ def test_jobs_of_one_share_that_end_together_share_their_commits(bench: Bench, m
     monkeypatch.setattr(Isolation, "_together", noted)
     for name in names:
         bench.engine.cluster.end(f"{name}/1/1", 0, 0)
-    ticks(bench, are(bench, Status.SUCCEEDED, *names))
+    bench.ticks(are(bench, Status.SUCCEEDED, *names))
     assert again == [], "done again, each by itself, since all of them together failed"
     with bench.database.session() as session:
         assert [(each.queue, each.share) for each in session.scalars(select(ShareUsage))] == [("urgent", "team")]
@@ -98,7 +88,7 @@ def test_an_attempt_whose_end_was_committed_without_an_answer_is_forgotten(
     bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bench.submit("one", "two", node_properties=properties(1))
-    ticks(bench, are(bench, Status.RUNNING, "one", "two"))
+    bench.ticks(are(bench, Status.RUNNING, "one", "two"))
     check, lost = Database.check, list[str]()
 
     def checked(self: Database) -> None:
@@ -112,14 +102,14 @@ def test_an_attempt_whose_end_was_committed_without_an_answer_is_forgotten(
 
     def passed() -> bool:
         try:
-            bench.controller.reconciler.tick()
+            bench.controller.tick()
         except DatabaseError as error:
-            bench.controller.reconciler._isolation.trouble = str(error)
+            bench.controller._isolation.trouble = str(error)
         with bench.database.session() as session:
             return bool(lost) and session.get_one(Job, "one").status == Status.SUCCEEDED
 
     wait_for(passed, 30, "the end")
-    bench.controller.reconciler.tick()
+    bench.controller.tick()
     attempts = bench.controller.attempts
     assert list(attempts._open) == ["two"]
     [runner] = attempts.engine._runners.values()

@@ -34,28 +34,28 @@ def test_a_stop_waits_for_those_of_its_own_engine_alone_and_its_reason_says_so(m
         return []
 
     engine = SimpleNamespace(stop=stop)
-    asked = Stops(engine, changed.append, logging.getLogger("test"))  # type: ignore[arg-type]
+    requested = Stops(engine, changed.append, logging.getLogger("test"))  # type: ignore[arg-type]
 
     def ask(job: str, engine: str) -> GangStatus | None:
-        return asked.ask((job, 1), Handle(engine, f"{job}/1/1", 1, {}).text(), 30.0)
+        return requested.ask((job, 1), Handle(engine, f"{job}/1/1", 1, {}).text(), 30.0)
 
     try:
         for job in ("a", "b", "c"):
             assert ask(job, "docker") is None
         ask("d", "slurm")
         wait_for(lambda: ask("d", "slurm") == [], 2, "a stop on an engine that answers")
-        assert 0 < asked.pause(("c", 1)) <= 0.1 or asked.reason(("c", 1))
-        wait_for(lambda: asked.reason(("c", 1)), 2, "that it says so, once it has waited for a while")
-        assert [asked.reason((job, 1)) for job in ("a", "b", "d")] == [None] * 3
+        assert 0 < requested.pause(("c", 1)) <= 0.1 or requested.reason(("c", 1))
+        wait_for(lambda: requested.reason(("c", 1)), 2, "that it says so, once it has waited for a while")
+        assert [requested.reason((job, 1)) for job in ("a", "b", "d")] == [None] * 3
         waits = "attempt 1 waits for its turn to be stopped: the docker engine is stopping 2 others"
-        assert asked.reason(("c", 1)) == waits and asked.has_begun(("c", 1))
+        assert requested.reason(("c", 1)) == waits and requested.has_begun(("c", 1))
         answers.set()
         wait_for(lambda: changed.count("c") == 2, 2, "that it has begun, and has returned")
-        assert asked.reason(("c", 1)) == "attempt 1 is being stopped"
-        assert ask("c", "docker") == [] and asked.reason(("c", 1)) is None
+        assert requested.reason(("c", 1)) == "attempt 1 is being stopped"
+        assert ask("c", "docker") == [] and requested.reason(("c", 1)) is None
     finally:
         answers.set()
-        asked.close()
+        requested.close()
 
 
 def test_why_a_gang_can_not_be_stopped_stays_its_reason_at_every_further_try(
@@ -76,17 +76,12 @@ def test_why_a_gang_can_not_be_stopped_stays_its_reason_at_every_further_try(
     monkeypatch.setattr(FakeEngine, "stop", deny)
     with ExitStack() as stack:
         bench = FakeController(tmp_path, FakeEngine(capacity=Hosts([Host("fake/host", 8.0, (), 8192)])), stack)
-
-        def ticked(done: bool) -> bool:
-            bench.controller.reconciler.tick()
-            return done
-
         bench.submit("a")
-        wait_for(lambda: ticked(bench.job("a").status == Status.RUNNING), 30, "that it runs")
+        bench.ticks(lambda: bench.job("a").status == Status.RUNNING)
         with bench.database.session() as session:
             ask_to_end(session, Job.id == "a", "enough")
         monkeypatch.setattr(Session, "commit", noted)
-        wait_for(lambda: ticked(len(tries) > 3), 30, "further tries")
+        bench.ticks(lambda: len(tries) > 3)
     denied = "attempt 1 can't be stopped: not authorized; trying again"
     assert "enough; its nodes are ending" in reasons
     first = reasons.index(denied)

@@ -73,7 +73,7 @@ def test_a_missing_or_publicly_readable_file_is_refused(tmp_path: Path) -> None:
     path.chmod(0o600)
     for text in ("{", "[]", '{"a b": {}}', '{"a": {"name": "b"}}'):
         path.write_text(text)
-        with pytest.raises(WebhooksError, match=r"not JSON|expected a JSON object|is no name of a webhook"):
+        with pytest.raises(WebhooksError, match=r"not JSON|expected a JSON object|is not a name for a webhook"):
             read_webhooks(str(path))
 
 

@@ -8,39 +8,19 @@ from typing import Any
 
 import pytest
 
+from orchestrator.domain import attempt_instructions as do
 from orchestrator.domain.attempt import CAUSE_PATIENCE, FINISHING, SHORTEST_REQUEUE, UNHEARD, AttemptState, Terms, step
 from orchestrator.domain.attempt_events import (
     Delayed,
     Due,
     Event,
     Gone,
-    LaunchDelayed,
     Launched,
-    LaunchRefused,
     Observed,
     Preempted,
     Prepared,
-    PrepareDelayed,
-    PrepareRefused,
+    Refused,
     Silence,
-)
-from orchestrator.domain.attempt_instructions import (
-    AwaitCause,
-    AwaitChildren,
-    Close,
-    Decide,
-    Explain,
-    Instruction,
-    Keep,
-    Launch,
-    MarkRunning,
-    Observe,
-    Prepare,
-    Save,
-    Stop,
-    TakeEpoch,
-    WindUp,
-    Withdraw,
 )
 from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
@@ -85,7 +65,7 @@ def end(code: int, **facts: Any) -> NodeEnd:
 
 
 RUNS = "attempt 2 runs on 2 nodes"
-SAYS_SO = Explain(RUNS)
+SAYS_SO = do.Explain(RUNS)
 DONE = Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
 STOPPED = Verdict(Ending.STOPPED, "enough")
 FAILED = Verdict(Ending.FAILED, "main node: exit 1", 1)
@@ -96,8 +76,8 @@ UNSURE = Verdict(Ending.FAILED, "main node: exit 143", 143, certain=False)
 QUIET = Silence(121.0, "12:00:00 UTC", False, "none is heard")
 GONE_QUIET = replace(QUIET, is_lost=True, cause="")
 FROZEN = Verdict(Ending.LOST, "node 1 has been silent for 121 s: it hangs, or its network is down")
-UNHEARD_SO = Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC (none is heard)")
-QUIET_SO = Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC")
+UNHEARD_SO = do.Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC (none is heard)")
+QUIET_SO = do.Explain("attempt 2 runs on 2 nodes; node 1 has been unreachable since 12:00:00 UTC")
 LATE = Verdict(Ending.TIMEOUT, "Job attempt duration exceeded timeout")
 REFUSED = Verdict(Ending.FATAL, "can't start the gang: no such image", start_error="no such image")
 DRIVER = "CannotStartContainerError: a driver"
@@ -106,108 +86,129 @@ GONE = Verdict(Ending.FAILED, "Host EC2 (instance h/0) terminated.")
 ROOMLESS = "attempt 2 runs on 2 of 4 nodes: there is no room for more"
 
 
-def ends(verdict: Verdict, grace: float = 35.0, first: Instruction = SAYS_SO) -> list[Instruction]:
+def ends(verdict: Verdict, grace: float = 35.0, first: do.Instruction = SAYS_SO) -> list[do.Instruction]:
     """A look at a gang brings its end about."""
     return [first, *decided(verdict, grace)]
 
 
-def decided(verdict: Verdict, grace: float = 35.0) -> list[Instruction]:
-    return [Decide(verdict), ending_so(verdict.reason), *stops(grace, verdict.reason)]
+def decided(verdict: Verdict, grace: float = 35.0) -> list[do.Instruction]:
+    return [do.Decide(verdict), ending_so(verdict.reason), *stops(grace, verdict.reason)]
 
 
-def stops(grace: float = 35.0, why: str = "why") -> list[Instruction]:
+def stops(grace: float = 35.0, why: str = "why") -> list[do.Instruction]:
     """The end is saved before the gang is stopped; what the stop adds to the reason stays until something else is known."""
-    return [Save(), Stop(grace, f"{why}; its nodes are ending")]
+    return [do.Save(), do.Stop(grace, f"{why}; its nodes are ending")]
 
 
-def ending_so(reason: str = "why") -> Instruction:
-    return Explain(f"{reason}; its nodes are ending")
+def ending_so(reason: str = "why") -> do.Instruction:
+    return do.Explain(f"{reason}; its nodes are ending")
 
 
 TIMED = with_terms(RUNNING, timeout=50)
 
-RULES: dict[str, tuple[AttemptState, Event, Sequence[Instruction]]] = {
+RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     # -- preparing
-    "a new attempt takes its run": (PREPARING, Due(), [Prepare()]),
-    "its epoch is saved before anything is launched": (PREPARING, Prepared(7), [TakeEpoch(7), Save(), Launch()]),
+    "a new attempt takes its run": (PREPARING, Due(), [do.Prepare()]),
+    "its epoch is saved before anything is launched": (
+        PREPARING,
+        Prepared(7),
+        [do.TakeEpoch(7), do.Save(), do.Launch()],
+    ),
     "a run that can't be used is final": (
         PREPARING,
-        PrepareRefused("it is damaged"),
-        [Decide(Verdict(Ending.FATAL, "it is damaged", start_error="it is damaged")), WindUp()],
+        Refused("it is damaged"),
+        [do.Decide(Verdict(Ending.FATAL, "it is damaged", start_error="it is damaged")), do.WindUp()],
     ),
-    "while its run can't be read, others may have its room": (PREPARING, PrepareDelayed("away"), [Withdraw("away")]),
-    "but not while a call on the store is under way": (PREPARING, Delayed("silent"), [Explain("silent")]),
-    "one that is not needed takes nothing": (asked(PREPARING), Due(), [Decide(STOPPED), WindUp()]),
-    "nor one that was preempted": (ending(Ending.PREEMPTED, of=PREPARING), Due(), [WindUp()]),
-    "the scheduler may take its place": (PREPARING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
+    "while its run can't be read, others may have its room": (
+        PREPARING,
+        Delayed("away", idle=True),
+        [do.Withdraw("away")],
+    ),
+    "but not while a call on the store is under way": (PREPARING, Delayed("silent"), [do.Explain("silent")]),
+    "one that is not needed takes nothing": (asked(PREPARING), Due(), [do.Decide(STOPPED), do.WindUp()]),
+    "nor one that was preempted": (ending(Ending.PREEMPTED, of=PREPARING), Due(), [do.WindUp()]),
+    "the scheduler may take its place": (
+        PREPARING,
+        Preempted("for b"),
+        [do.Decide(Verdict(Ending.PREEMPTED, "for b"))],
+    ),
     # -- launching
-    "what is recorded is launched": (LAUNCHING, Due(), [Launch()]),
-    "what is to end is not launched anew": (ending(Ending.PREEMPTED, of=LAUNCHING), Due(), [Launch(again=False)]),
-    "nor on request": (asked(LAUNCHING), Due(), [Launch(again=False)]),
+    "what is recorded is launched": (LAUNCHING, Due(), [do.Launch()]),
+    "what is to end is not launched anew": (ending(Ending.PREEMPTED, of=LAUNCHING), Due(), [do.Launch(again=False)]),
+    "nor on request": (asked(LAUNCHING), Due(), [do.Launch(again=False)]),
     "what was preempted before it could start is over": (
         ending(Ending.PREEMPTED, of=LAUNCHING),
-        LaunchDelayed("pulling the image", False),
-        [WindUp()],
+        Delayed("pulling the image", idle=True),
+        [do.WindUp()],
     ),
-    "a handle is saved at once": (LAUNCHING, Launched("handle"), [Keep("handle"), Save(), Observe()]),
-    "a launch that waits says why": (LAUNCHING, LaunchDelayed("no room", False), [Explain("no room")]),
-    "or nothing yet": (LAUNCHING, LaunchDelayed("", True), []),
-    "one that is not needed is given up": (asked(LAUNCHING), LaunchDelayed("full", False), [Decide(STOPPED), WindUp()]),
-    "unless something may run": (asked(LAUNCHING), LaunchDelayed("silent", True), [Explain("silent")]),
+    "a handle is saved at once": (LAUNCHING, Launched("handle"), [do.Keep("handle"), do.Save(), do.Observe()]),
+    "a launch that waits says why": (LAUNCHING, Delayed("no room", idle=True), [do.Explain("no room")]),
+    "or nothing yet": (LAUNCHING, Delayed(""), []),
+    "one that is not needed is given up": (
+        asked(LAUNCHING),
+        Delayed("full", idle=True),
+        [do.Decide(STOPPED), do.WindUp()],
+    ),
+    "unless something may run": (asked(LAUNCHING), Delayed("silent"), [do.Explain("silent")]),
     "a refusal of what is to end anyway changes nothing": (
         ending(Ending.PREEMPTED, of=LAUNCHING),
-        LaunchRefused("gone", is_final=False),
-        [WindUp()],
+        Refused("gone", is_final=False),
+        [do.WindUp()],
     ),
-    "a refusal is final": (LAUNCHING, LaunchRefused("no such image"), [Decide(REFUSED), WindUp()]),
+    "a refusal is final": (LAUNCHING, Refused("no such image"), [do.Decide(REFUSED), do.WindUp()]),
     "a start that failed is an attempt that failed": (
         LAUNCHING,
-        LaunchRefused(DRIVER, is_final=False),
-        [Decide(Verdict(Ending.FAILED, DRIVER, start_error=DRIVER)), WindUp()],
+        Refused(DRIVER, is_final=False),
+        [do.Decide(Verdict(Ending.FAILED, DRIVER, start_error=DRIVER)), do.WindUp()],
     ),
     "on AWS it has AWS's reason": (
         on_aws(LAUNCHING),
-        LaunchRefused(DRIVER, is_final=False),
-        [Decide(Verdict(Ending.FAILED, "Task failed to start", start_error=DRIVER)), WindUp()],
+        Refused(DRIVER, is_final=False),
+        [do.Decide(Verdict(Ending.FAILED, "Task failed to start", start_error=DRIVER)), do.WindUp()],
     ),
     "so has a refusal on AWS": (
         on_aws(LAUNCHING),
-        LaunchRefused("no such image"),
-        [Decide(Verdict(Ending.FATAL, "Task failed to start", start_error="no such image")), WindUp()],
+        Refused("no such image"),
+        [do.Decide(Verdict(Ending.FATAL, "Task failed to start", start_error="no such image")), do.WindUp()],
     ),
     "before its launch nothing can be seen of it": (LAUNCHING, seen(), []),
     # -- what is told
-    "what is launched is looked at": (STARTING, Due(), [Observe()]),
-    "also while it runs": (RUNNING, Due(), [Observe()]),
-    "and while it ends": (ending(Ending.FAILED), Due(), [Observe()]),
-    "a main node that waits says why": (STARTING, seen(waits="queued"), [Explain("queued")]),
-    "also one that can't be seen any more": (RUNNING, seen(waits="silent"), [Explain("silent")]),
-    "the main node's first sign makes the job run": (STARTING, seen(), [MarkRunning(RUNS, T)]),
-    "in the engine's words where it has some": (STARTING, seen(words="on n1"), [MarkRunning("on n1", T)]),
-    "so does an end that came before any sign": (STARTING, seen(*MAIN_LAST), ends(DONE, first=MarkRunning(RUNS, T))),
-    "a gang with too little room is called so": (with_terms(RUNNING, whole=4), seen(), [Explain(ROOMLESS)]),
+    "what is launched is looked at": (STARTING, Due(), [do.Observe()]),
+    "also while it runs": (RUNNING, Due(), [do.Observe()]),
+    "and while it ends": (ending(Ending.FAILED), Due(), [do.Observe()]),
+    "a main node that waits says why": (STARTING, seen(waits="queued"), [do.Explain("queued")]),
+    "also one that can't be seen any more": (RUNNING, seen(waits="silent"), [do.Explain("silent")]),
+    "the main node's first sign makes the job run": (STARTING, seen(), [do.MarkRunning(RUNS, T)]),
+    "in the engine's words where it has some": (STARTING, seen(words="on n1"), [do.MarkRunning("on n1", T)]),
+    "so does an end that came before any sign": (STARTING, seen(*MAIN_LAST), ends(DONE, first=do.MarkRunning(RUNS, T))),
+    "a gang with too little room is called so": (with_terms(RUNNING, whole=4), seen(), [do.Explain(ROOMLESS)]),
     "one node is no nodes": (
         with_terms(RUNNING, hosts=("h/0",), whole=1),
         seen(None, silences=(None,)),
-        [Explain("attempt 2 runs on 1 node")],
+        [do.Explain("attempt 2 runs on 1 node")],
     ),
     # -- what ends it
     "the main node's end decides": (RUNNING, seen(*MAIN_LAST), ends(DONE)),
     "a failure has little to save": (RUNNING, seen(end(1), None), ends(FAILED, 5.0)),
-    "what was told to end waits for the cause": (RUNNING, seen(KILLED, None), [SAYS_SO, AwaitCause(T)]),
+    "so has a child's that is final": (
+        with_terms(RUNNING, options=replace(NATIVE, on_child_failure="fail")),
+        seen(None, end(1)),
+        ends(Verdict(Ending.FATAL, "node 1: exit 1", 1), 5.0),
+    ),
+    "what was told to end waits for the cause": (RUNNING, seen(KILLED, None), [SAYS_SO, do.Await("cause_since", T)]),
     "since the first time": (
         replace(RUNNING, cause_since=T - CAUSE_PATIENCE),
         seen(KILLED, None),
-        [SAYS_SO, AwaitCause(T - CAUSE_PATIENCE)],
+        [SAYS_SO, do.Await("cause_since", T - CAUSE_PATIENCE)],
     ),
     "but not for ever": (replace(RUNNING, cause_since=T - CAUSE_PATIENCE - 1), seen(KILLED, None), ends(UNSURE, 5.0)),
     "nor when the job is to stop": (
         asked(RUNNING),
         seen(KILLED, None),
-        [SAYS_SO, AwaitCause(T), *decided(STOPPED)],
+        [SAYS_SO, do.Await("cause_since", T), *decided(STOPPED)],
     ),
     "a request ends it": (asked(RUNNING), seen(), ends(STOPPED)),
-    "also before it runs": (asked(STARTING), seen(waits="queued"), ends(STOPPED, first=Explain("queued"))),
+    "also before it runs": (asked(STARTING), seen(waits="queued"), ends(STOPPED, first=do.Explain("queued"))),
     "an end counts more than a request": (asked(RUNNING), seen(*MAIN_LAST), ends(DONE)),
     "a node that is lost ends it, with its whole grace": (
         RUNNING,
@@ -225,12 +226,12 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[Instruction]]] = {
     "that of the main node loses its host": (
         on_aws(RUNNING),
         seen(silences=(GONE_QUIET, None)),
-        ends(replace(GONE, ending=Ending.LOST), 35.0, first=Explain(f"{RUNS}; the main node{QUIET_SO.reason[33:]}")),
+        ends(replace(GONE, ending=Ending.LOST), 35.0, first=do.Explain(f"{RUNS}; the main node{QUIET_SO.reason[33:]}")),
     ),
     "while it is not known how nodes ended, the store is named": (
         RUNNING,
         seen(unread="the store is away", stale="Slurm is away"),
-        [Explain("Slurm is away; the store is away")],
+        [do.Explain("Slurm is away; the store is away")],
     ),
     "or nothing yet, and nothing follows from ends": (RUNNING, seen(end(1), None, unread=""), []),
     "a request does not wait for the store": (asked(RUNNING), seen(unread=""), decided(STOPPED)),
@@ -252,15 +253,15 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[Instruction]]] = {
     "an engine that does not answer is named": (
         RUNNING,
         seen(stale="Slurm is away"),
-        [Explain(f"{RUNS}; Slurm is away")],
+        [do.Explain(f"{RUNS}; Slurm is away")],
     ),
     "time ends it": (replace(TIMED, running_since=T - 50_001), seen(), ends(LATE)),
     "to the second": (TIMED, seen(), [SAYS_SO]),
     "on AWS a child's end is nothing": (on_aws(RUNNING), seen(None, end(1)), [SAYS_SO]),
     "and the main node's everything": (on_aws(RUNNING), seen(end(1), None), ends(AWS_FAILED, 5.0)),
     "where it vanished its host is named": (on_aws(RUNNING), seen(end(137, lost=True), None), ends(GONE, 5.0)),
-    "the scheduler ends it": (RUNNING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
-    "also before its launch": (LAUNCHING, Preempted("for b"), [Decide(Verdict(Ending.PREEMPTED, "for b"))]),
+    "the scheduler ends it": (RUNNING, Preempted("for b"), [do.Decide(Verdict(Ending.PREEMPTED, "for b"))]),
+    "also before its launch": (LAUNCHING, Preempted("for b"), [do.Decide(Verdict(Ending.PREEMPTED, "for b"))]),
     "not twice": (ending(Ending.FAILED), Preempted("for b"), []),
     # -- how it is ended
     "an end that is decided stays": (asked(ending(Ending.FAILED)), seen(*MAIN_LAST), stops(5.0)),
@@ -273,17 +274,17 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[Instruction]]] = {
     "one that is seen to run only now says why it ends nevertheless": (
         ending(Ending.PREEMPTED, of=STARTING),
         seen(),
-        [MarkRunning(RUNS, T), ending_so(), *stops()],
+        [do.MarkRunning(RUNS, T), ending_so(), *stops()],
     ),
     "children of a main node that is done may end": (
         RUNNING,
         seen(end(0), None),
-        [SAYS_SO, Decide(DONE), ending_so(DONE.reason), Save(), AwaitChildren(T)],
+        [SAYS_SO, do.Decide(DONE), ending_so(DONE.reason), do.Save(), do.Await("done_since", T)],
     ),
     "for a while": (
         replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING + 1),
         seen(end(0), None),
-        [ending_so(), Save(), AwaitChildren(T - FINISHING + 1)],
+        [ending_so(), do.Save(), do.Await("done_since", T - FINISHING + 1)],
     ),
     "and no longer": (
         replace(ending(Ending.SUCCEEDED), done_since=T - FINISHING),
@@ -294,10 +295,11 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[Instruction]]] = {
     "an old picture is named": (
         ending(Ending.FAILED),
         seen(stale="Slurm to answer"),
-        [Save(), Stop(5.0, "why; waits for Slurm to answer")],
+        [do.Save(), do.Stop(5.0, "why; waits for Slurm to answer")],
     ),
-    "a stop that fails is told": (ending(Ending.FAILED), Delayed("not allowed"), [Explain("not allowed")]),
-    "so is a store that can't be read": (RUNNING, Delayed("the store is away"), [Explain("the store is away")]),
+    "a stop that fails is told": (ending(Ending.FAILED), Delayed("not allowed"), [do.Explain("not allowed")]),
+    "so is a store that can't be read": (RUNNING, Delayed("the store is away"), [do.Explain("the store is away")]),
+    "one that is closed stays so": (replace(ending(Ending.FAILED), closed=True), Gone(T, MAIN_LAST, ""), []),
     "a gang does not go before its end is decided": (RUNNING, Gone(T, MAIN_LAST, ""), []),
 }
 
@@ -375,7 +377,7 @@ CLOSES: dict[str, tuple[AttemptState, Sequence[NodeEnd | None], bool, Status, st
     "done before its time was over": (ending(Ending.TIMEOUT), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
     "stopped with 0 when its time was over": (ending(Ending.TIMEOUT), ASKED_LAST, SPENT, S.FAILED, "why"),
     "done before it was preempted": (ending(Ending.PREEMPTED), MAIN_LAST, FREE, S.SUCCEEDED, DONE_SO),
-    "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=2), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
+    "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=3), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
     "left at once": (AT_ONCE, BOTH_LEFT, SPENT, S.RUNNABLE, LEFT_SO),
     "left at once, the last time": (with_terms(AT_ONCE, spent=2), BOTH_LEFT, SPENT, S.FAILED, "why"),
     "lost": (ending(Ending.LOST), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
@@ -437,12 +439,12 @@ CLOSES: dict[str, tuple[AttemptState, Sequence[NodeEnd | None], bool, Status, st
 @pytest.mark.parametrize("case", CLOSES)
 def test_how_an_attempt_ended_says_what_becomes_of_its_job(case: str) -> None:
     state, ends, spent, status, reason = CLOSES[case]
-    assert step(state, Gone(T, ends, SAVED)) == (Close(T, spent, status, reason),)
+    assert step(state, Gone(T, ends, SAVED)) == (do.Close(T, spent, status, reason),)
 
 
 def test_a_long_reason_leaves_room_for_the_fault_that_came_again() -> None:
     state = faulty(FAULT)
     long = replace(state, verdict=replace(FAILED, reason="y" * 5000, fault=FAULT))
     (close,) = step(long, Gone(T, MAIN_FAILED, SAVED))
-    assert isinstance(close, Close) and close.reason.endswith(REPEATED_SO.removeprefix("why"))
+    assert isinstance(close, do.Close) and close.reason.endswith(REPEATED_SO.removeprefix("why"))
     assert len(close.reason) == LONGEST_REASON and close.reason.startswith("yyyy")

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+from orchestrator.domain import attempt_instructions as do
 from orchestrator.domain.attempt import SHORTEST_REQUEUE, AttemptState, Terms, step
 from orchestrator.domain.attempt_events import Gone
-from orchestrator.domain.attempt_instructions import Close
 from orchestrator.domain.job import Ending, NodeEnd, Status, Verdict
 from orchestrator.domain.native_options import NativeOptions
 
@@ -44,15 +44,15 @@ def test_a_gang_that_others_cancel_is_started_again_a_bounded_number_of_times(
     state = replace(state, terms=replace(TERMS, cancelled=before, allowed=allowed))
     gone = Gone(T, (NodeEnd(75, "left on request", 1.0, asked=True),) * 2, SAVED, HOW, most)
     (close,) = step(state, gone)
-    assert close == Close(T, False, status, f"attempt 2 was {HOW}{SAVED}{words}", HOW)
+    assert close == do.Close(T, False, status, f"attempt 2 was {HOW}{SAVED}{words}", HOW)
 
 
 def test_a_gang_that_others_cancel_at_once_spends_an_attempt_and_one_that_its_user_stops_is_stopped() -> None:
     state = replace(ENDING, running_since=T - SHORTEST_REQUEUE + 1)
     gone = Gone(T, (), SAVED, HOW, 3)
     (close,) = step(replace(state, terms=replace(TERMS, allowed=3, spent=1)), gone)
-    assert isinstance(close, Close) and (close.spent, close.status) == (True, Status.RUNNABLE)
+    assert isinstance(close, do.Close) and (close.spent, close.status) == (True, Status.RUNNABLE)
     (close,) = step(replace(state, terms=replace(TERMS, allowed=2, spent=2)), gone)
-    assert isinstance(close, Close) and (close.spent, close.status) == (True, Status.FAILED)
+    assert isinstance(close, do.Close) and (close.spent, close.status) == (True, Status.FAILED)
     (close,) = step(replace(state, stop_reason="enough"), gone)
-    assert close == Close(T, True, Status.FAILED, f"enough{SAVED}")
+    assert close == do.Close(T, True, Status.FAILED, f"enough{SAVED}")

@@ -8,7 +8,20 @@ from dataclasses import dataclass, replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from orchestrator.domain import attempt, attempt_events, attempt_instructions
+from orchestrator.domain import attempt
+from orchestrator.domain import attempt_instructions as do
+from orchestrator.domain.attempt_events import (
+    Delayed,
+    Due,
+    Event,
+    Gone,
+    Launched,
+    Observed,
+    Preempted,
+    Prepared,
+    Refused,
+    Silence,
+)
 from orchestrator.domain.job import Ending, NodeEnd, Status
 from orchestrator.domain.native_options import NativeOptions
 
@@ -20,41 +33,35 @@ node_ends = st.none() | st.builds(
     NodeEnd, codes, st.just("why"), st.floats(0, 9), lost=st.booleans(), asked=st.booleans()
 )
 both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NODES)
-silence = st.builds(
-    attempt_events.Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "deaf"])
-)
+silence = st.builds(Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "deaf"]))
 silences = st.just([None] * NODES) | st.lists(st.none() | silence, min_size=NODES, max_size=NODES)
 words = st.sampled_from(["", "words"])
-delays = st.builds(attempt_events.LaunchDelayed, words, st.booleans())
-prepared = st.just(attempt_events.Prepared(7))
+delays = st.builds(Delayed, words, st.booleans())
+prepared = st.just(Prepared(7))
 prepares = st.one_of(
     *[prepared] * 3,
-    *(st.none(), st.just(attempt_events.Delayed("silent")), st.just(attempt_events.PrepareRefused("refused"))),
+    *(st.none(), st.just(Delayed("silent")), st.just(Refused("refused"))),
 )
-launches = st.one_of(
-    *[st.just(attempt_events.Launched("handle"))] * 4, delays, st.just(attempt_events.LaunchRefused("refused"))
-)
-looks = st.builds(attempt_events.Observed, moments, both, silences, words, words, words)
-gone = st.builds(attempt_events.Gone, moments, both | st.just([]), words)
-stops = st.one_of(gone, gone, gone, st.none(), st.just(attempt_events.Delayed("not allowed")))
+launches = st.one_of(*[st.just(Launched("handle"))] * 4, delays, st.just(Refused("refused")))
+looks = st.builds(Observed, moments, both, silences, words, words, words)
+gone = st.builds(Gone, moments, both | st.just([]), words)
+stops = st.one_of(gone, gone, gone, st.none(), st.just(Delayed("not allowed")))
 
 
 @dataclass(frozen=True)
 class Turn:
     """One turn of the controller: what happens before its look, and what the engine answers where it is asked."""
 
-    before: attempt_events.Event | str | None
+    before: Event | str | None
     """A text: the user asks the job to end, which a request writes to the database."""
-    prepare: attempt_events.Event | None
-    launch: attempt_events.Event
-    seen: attempt_events.Observed
-    stop: attempt_events.Event | None
+    prepare: Event | None
+    launch: Event
+    seen: Observed
+    stop: Event | None
 
 
 out_of_place = st.one_of(launches, looks, gone)
-before = st.one_of(
-    *[st.none()] * 4, st.just("enough"), st.just(attempt_events.Preempted("preempted by job b")), out_of_place
-)
+before = st.one_of(*[st.none()] * 4, st.just("enough"), st.just(Preempted("preempted by job b")), out_of_place)
 turns = st.builds(Turn, before, prepares, launches, looks, stops)
 policies = st.sampled_from(["ignore", "restart", "fail"])
 terms = st.builds(
@@ -76,16 +83,16 @@ class Page:
     """An event of a story and what followed from it."""
 
     before: attempt.AttemptState
-    event: attempt_events.Event
-    instructions: attempt_instructions.Instructions
+    event: Event
+    instructions: do.Instructions
     now: attempt.AttemptState
 
 
-def told(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
+def story_of(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
     """A job's attempts, one after the other."""
     state, pages = attempt.AttemptState(terms), list[Page]()
     for turn in turns:
-        events: list[attempt_events.Event] = [attempt_events.Due()]
+        events: list[Event] = [Due()]
         if isinstance(turn.before, str):
             state = state if state.closed else replace(state, stop_reason=turn.before)
         elif turn.before is not None:
@@ -96,16 +103,16 @@ def told(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
             for instruction in instructions:
                 state = attempt.after(state, instruction)
                 match instruction:
-                    case attempt_instructions.Prepare() if turn.prepare is not None:
+                    case do.Prepare() if turn.prepare is not None:
                         events.append(turn.prepare)
-                    case attempt_instructions.Launch():
+                    case do.Launch():
                         events.append(turn.launch)
-                    case attempt_instructions.Observe():
+                    case do.Observe():
                         events.append(turn.seen)
-                    case attempt_instructions.Stop() if turn.stop is not None:
+                    case do.Stop() if turn.stop is not None:
                         events.append(turn.stop)
-                    case attempt_instructions.WindUp():
-                        events.append(attempt_events.Gone(turn.seen.moment, [], ""))
+                    case do.WindUp():
+                        events.append(Gone(turn.seen.moment, [], ""))
             pages.append(Page(before, event, instructions, state))
             if (close := closed(pages[-1])) is not None and close.status is Status.RUNNABLE:  # the next attempt
                 spent = state.terms.spent + close.spent
@@ -114,43 +121,31 @@ def told(terms: attempt.Terms, turns: Sequence[Turn]) -> list[Page]:
     return pages
 
 
-def closed(page: Page) -> attempt_instructions.Close | None:
-    return next((each for each in page.instructions if isinstance(each, attempt_instructions.Close)), None)
+def closed(page: Page) -> do.Close | None:
+    return next((each for each in page.instructions if isinstance(each, do.Close)), None)
 
 
-stories = st.builds(told, terms, st.lists(turns, min_size=8, max_size=14))
+stories = st.builds(story_of, terms, st.lists(turns, min_size=8, max_size=14))
 
 
 @settings(max_examples=50)
 @given(stories)
 def test_each_epoch_is_launched_once_and_nothing_is_stopped_before_its_end_is_saved(story: list[Page]) -> None:
-    kept = [
-        page.before.terms.number
-        for page in story
-        for each in page.instructions
-        if isinstance(each, attempt_instructions.Keep)
-    ]
+    kept = [page.before.terms.number for page in story for each in page.instructions if isinstance(each, do.Keep)]
     assert len(kept) == len(set(kept)), "a second handle of one epoch"
     for page in story:
-        assert (
-            not any(isinstance(each, attempt_instructions.Launch) for each in page.instructions)
-            or not page.before.launched
-        )
+        assert not any(isinstance(each, do.Launch) for each in page.instructions) or not page.before.launched
         for index, each in enumerate(page.instructions):
-            if isinstance(each, attempt_instructions.Stop):
+            if isinstance(each, do.Stop):
                 assert page.before.launched and page.now.verdict is not None
-                assert page.before.verdict is not None or attempt_instructions.Save() in page.instructions[:index], (
+                assert page.before.verdict is not None or do.Save() in page.instructions[:index], (
                     "a crash would forget it"
                 )
-            if isinstance(each, attempt_instructions.Keep | attempt_instructions.TakeEpoch):
-                assert attempt_instructions.Save() in page.instructions[index:], "a crash would forget it"
+            if isinstance(each, do.Keep | do.TakeEpoch):
+                assert do.Save() in page.instructions[index:], "a crash would forget it"
             if isinstance(
                 each,
-                attempt_instructions.Prepare
-                | attempt_instructions.Launch
-                | attempt_instructions.Observe
-                | attempt_instructions.Stop
-                | attempt_instructions.WindUp,
+                do.Prepare | do.Launch | do.Observe | do.Stop | do.WindUp,
             ):
                 assert each is page.instructions[-1], "what it leads to is decided on when all else is carried out"
 
@@ -177,50 +172,31 @@ def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
         assert page.now.stop_reason == page.before.stop_reason
         if (close := closed(page)) is not None:
             assert close.status.is_terminal, "it is started again"
-        if isinstance(page.event, attempt_events.Observed) and page.before.launched:
+        if isinstance(page.event, Observed) and page.before.launched:
             assert page.now.verdict is not None, "the next look decides its end"
-        if (
-            isinstance(page.event, attempt_events.LaunchDelayed)
-            and page.before.phase is attempt.AttemptPhase.LAUNCHING
-            and not page.event.unknown
-        ):
-            assert attempt_instructions.WindUp() in page.instructions, "nothing is launched any more"
+        if isinstance(page.event, Delayed) and page.before.phase is attempt.AttemptPhase.LAUNCHING and page.event.idle:
+            assert do.WindUp() in page.instructions, "nothing is launched any more"
 
 
 @settings(max_examples=50)
 @given(stories, looks)
 def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_reason_or_brings_the_end_about(
-    story: list[Page], seen: attempt_events.Observed
+    story: list[Page], seen: Observed
 ) -> None:
     for page in story:
         state = page.now
         if state.closed:
             continue
-        next_look = (
-            attempt_instructions.Observe
-            if state.launched
-            else attempt_instructions.Launch
-            if state.prepared
-            else attempt_instructions.Prepare
-        )
-        wanted = (
-            next_look
-            if state.prepared or (state.verdict is None and state.stop_reason is None)
-            else attempt_instructions.WindUp
-        )
-        assert isinstance(attempt.step(state, attempt_events.Due())[-1], wanted)
+        next_look = do.Observe if state.launched else do.Launch if state.prepared else do.Prepare
+        expected = next_look if state.prepared or (state.verdict is None and state.stop_reason is None) else do.WindUp
+        assert isinstance(attempt.step(state, Due())[-1], expected)
         follows = attempt.step(state, seen) if state.launched else ()
-        if state.verdict is not None or any(isinstance(each, attempt_instructions.Decide) for each in follows):
-            assert not follows or isinstance(
-                follows[-1], attempt_instructions.Stop | attempt_instructions.AwaitChildren
-            )
+        if state.verdict is not None or any(isinstance(each, do.Decide) for each in follows):
+            assert not follows or isinstance(follows[-1], do.Stop | do.Await)
         elif state.launched and (
             follows or seen.unread is None
         ):  # of ends that are being read nothing is said at first
-            assert (
-                isinstance(follows[0], attempt_instructions.Explain | attempt_instructions.MarkRunning)
-                and follows[0].reason
-            )
+            assert isinstance(follows[0], do.Explain | do.MarkRunning) and follows[0].reason
 
 
 @settings(max_examples=50)
@@ -229,7 +205,7 @@ def test_an_end_that_was_decided_for_a_launched_gang_stays(story: list[Page]) ->
     for page in story:
         if page.before.launched and page.before.verdict is not None:
             assert page.now.verdict == page.before.verdict
-            assert not any(isinstance(each, attempt_instructions.Decide) for each in page.instructions)
+            assert not any(isinstance(each, do.Decide) for each in page.instructions)
 
 
 @settings(max_examples=50)
@@ -255,11 +231,11 @@ def test_a_gang_whose_main_node_is_done_succeeds(terms: attempt.Terms, turns: Se
     answered = [
         Turn(
             None,
-            attempt_events.Prepared(7),
-            attempt_events.Launched("handle"),
+            Prepared(7),
+            Launched("handle"),
             replace(turn.seen, ends=done, waits="", unread=None),
-            attempt_events.Gone(turn.seen.moment, done, ""),
+            Gone(turn.seen.moment, done, ""),
         )
         for turn in turns
     ]
-    assert [each.status for page in told(terms, answered) if (each := closed(page))] == [Status.SUCCEEDED]
+    assert [each.status for page in story_of(terms, answered) if (each := closed(page))] == [Status.SUCCEEDED]

@@ -65,11 +65,11 @@ def test_a_node_has_what_its_container_asks_for_and_else_what_aws_takes() -> Non
     kinds = {"VCPU": "2.5", "GPU": "3", "MEMORY": "512"}
     required = {"resourceRequirements": [{"type": kind, "value": value} for kind, value in kinds.items()]}
     older = {"vcpus": 3, "memory": 700}
-    asked = definition(
+    requested = definition(
         ("0", required), ("1", older), ("2", {"resourceRequirements": None, "environment": None}), ("3", {})
     )
-    asked["nodeRangeProperties"][3] = {"targetNodes": "3", "ecs": "main"}
-    spec = gang_needs(asked)
+    requested["nodeRangeProperties"][3] = {"targetNodes": "3", "ecs": "main"}
+    spec = gang_needs(requested)
     assert [node.resources for node in spec.nodes] == [
         Resources(2.5, 3, 512),
         Resources(3, 0, 700),
@@ -107,12 +107,12 @@ def test_options_and_spec_are_those_of_the_main_node() -> None:
 
 @pytest.mark.parametrize("ranks", ["0", "-1", "two", "1.5", " 2", "9999999", "10"])
 def test_ranks_are_a_whole_number_from_1_on(ranks: str) -> None:
-    asked = definition(("0:", variables(MUSTER_RANKS_PER_NODE=ranks)))
+    requested = definition(("0:", variables(MUSTER_RANKS_PER_NODE=ranks)))
     if ranks == "10":
-        assert gang_needs(asked).nodes[3].ranks == 10
+        assert gang_needs(requested).nodes[3].ranks == 10
     else:
         with pytest.raises(MalformedOptions, match=f"MUSTER_RANKS_PER_NODE is '{ranks}'"):
-            gang_needs(asked)
+            gang_needs(requested)
 
 
 def test_a_shape_groups_equal_nodes_the_most_demanding_first_and_sums_them() -> None:

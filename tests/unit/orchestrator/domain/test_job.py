@@ -21,6 +21,7 @@ from orchestrator.domain.job import (
     has_exited,
     judge,
     judge_as_aws,
+    retries,
 )
 
 S = Status
@@ -35,10 +36,10 @@ LEGAL = {
 
 def ends(*codes: tuple[float, ...] | int | None) -> list[NodeEnd | None]:
     """By node index: a code, its time and whether it was asked to end, or None for a node that runs."""
-    told = [each if isinstance(each, tuple) else (each,) for each in codes]
+    reported = [each if isinstance(each, tuple) else (each,) for each in codes]
     return [
         None if each[0] is None else NodeEnd(int(each[0]), f"exit {each[0]}", *each[1:2] or (1.0,), asked=len(each) > 2)
-        for each in told
+        for each in reported
     ]
 
 
@@ -210,11 +211,42 @@ def test_the_reason_of_a_container_is_the_one_that_aws_gives(
 
 @pytest.mark.parametrize("policy", ["restart", "ignore", "fail"])
 def test_the_fault_of_the_node_that_was_the_cause_is_the_attempts(policy: str) -> None:
-    here, there = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"
-    main, child = NodeEnd(1, "exit 1", 1.0, fault=here), NodeEnd(1, "exit 1", 2.0, fault=there)
+    here, present = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"
+    main, child = NodeEnd(1, "exit 1", 1.0, fault=here), NodeEnd(1, "exit 1", 2.0, fault=present)
     verdict = judge(policy, 0, (main, child))
     assert verdict is not None and verdict.fault == here
     late = judge(policy, 0, (replace(main, ended=3.0), child))
-    assert late is not None and late.fault == (here if policy == "ignore" else there)
+    assert late is not None and late.fault == (here if policy == "ignore" else present)
     aws = judge_as_aws(0, (main, child), "host")
     assert aws is not None and aws.fault is None
+
+
+EXIT, RETRY = {"action": "EXIT"}, {"action": "retry"}
+
+# conditions, exit code → whether the attempt is tried again; its reason is "OutOfMemory: killed", its status reason "Host lost"
+CONDITIONS = {
+    "nothing said": ([], 1, True),
+    "nothing matches": ([{**EXIT, "onExitCode": "2"}], 1, True),
+    "the code matches": ([{**EXIT, "onExitCode": "1"}], 1, False),
+    "a part of the code does not": ([{**EXIT, "onExitCode": "1"}], 12, True),
+    "a pattern ends in a star": ([{**EXIT, "onExitCode": "1*"}], 12, False),
+    "and begins with the text": ([{**EXIT, "onExitCode": "1*"}], 21, True),
+    "a star alone matches all": ([{**EXIT, "onReason": "*"}], 1, False),
+    "a star in front is a star": ([{**EXIT, "onReason": "*killed"}], 1, True),
+    "the reason matches": ([{**EXIT, "onReason": "OutOfMemory*"}], 1, False),
+    "the status reason matches": ([{**EXIT, "onStatusReason": "Host*"}], 1, False),
+    "another status reason does not": ([{**EXIT, "onStatusReason": "Network*"}], 1, True),
+    "all that is named has to match": ([{**EXIT, "onExitCode": "1", "onReason": "no*"}], 1, True),
+    "an empty pattern is not named": ([{**EXIT, "onExitCode": "1", "onReason": ""}], 1, False),
+    "without a container there is no code": ([{**EXIT, "onExitCode": "*"}], None, False),
+    "and none equals it": ([{**EXIT, "onExitCode": "None"}], None, True),
+    "nor begins it": ([{**EXIT, "onExitCode": " *"}], None, True),
+    "the first that matches decides": ([{**RETRY, "onExitCode": "1"}, {**EXIT, "onExitCode": "*"}], 1, True),
+    "whatever follows": ([{**EXIT, "onExitCode": "*"}, {**RETRY, "onExitCode": "1"}], 1, False),
+}
+
+
+@pytest.mark.parametrize("case", CONDITIONS)
+def test_the_first_condition_that_matches_decides(case: str) -> None:
+    conditions, code, expected = CONDITIONS[case]
+    assert retries(conditions, code, "OutOfMemory: killed", "Host lost") is expected

@@ -16,9 +16,9 @@ def test_a_node_without_variables_of_muster_has_what_aws_does() -> None:
 
 
 def test_settings_of_the_job_yaml_reach_the_training() -> None:
-    given = {"on_child_failure": "fail", "preemptible": True, "logs": {"limit": "2MiB"}, "stall_timeout": "45s"}
+    values = {"on_child_failure": "fail", "preemptible": True, "logs": {"limit": "2MiB"}, "stall_timeout": "45s"}
     document = {"name": "ant", "train": {"task": "Ant", "worlds": 16, "iterations": 3}}
-    definition = compile_definition(validate({**document, **given}, "s"), "/home/me")
+    definition = compile_definition(validate({**document, **values}, "s"), "/home/me")
     [entry] = definition["nodeProperties"]["nodeRangeProperties"]
     variables = {pair["name"]: pair["value"] for pair in entry["container"]["environment"]}
     assert NativeOptions.read({**variables, "MUSTER_RUN": "old", "MUSTER_WORLDS": "64"}) == NativeOptions(

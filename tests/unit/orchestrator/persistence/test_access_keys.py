@@ -16,13 +16,6 @@ from tests.support.waiting import wait_for
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database.at(tmp_path)
-    yield database
-    database.close()
-
-
-@pytest.fixture
 def keys(database: Database, tmp_path: Path) -> KeyStore:
     return KeyStore(OwnSecrets(database, tmp_path))
 
@@ -44,7 +37,7 @@ def test_a_key_of_another_process_is_seen_at_the_next_look_and_its_deletion_too(
 ) -> None:
     made = others.create("a", ["robots", "robots"], read_only=True)
     assert names(keys) == []
-    keys.look_again()
+    keys.refresh()
     assert keys.current() == {made.access_key_id: made} and made.queues == ("robots",) and made.secret not in repr(made)
     monkeypatch.setattr(access_keys, "INTERVAL", 0.01)
     keys.start()
@@ -115,7 +108,7 @@ def test_while_the_database_can_not_be_read_the_keys_stay_and_a_damaged_one_is_r
     with monkeypatch.context() as patch:
         patch.setattr(database, "check", fail)
         for _ in range(3):
-            keys.look_again()
+            keys.refresh()
             assert names(keys) == ["a", "b"]
         with pytest.raises(DatabaseError):
             keys.load()
@@ -123,7 +116,7 @@ def test_while_the_database_can_not_be_read_the_keys_stay_and_a_damaged_one_is_r
     with database.session() as session:
         session.connection().exec_driver_sql("UPDATE access_keys SET sealed = 'x' WHERE name = 'b'")
     for _ in range(3):
-        keys.look_again()
+        keys.refresh()
         assert names(keys) == ["a"]
     assert [record.message for record in caplog.records] == [
         "key b is damaged in the database, and is refused: muster keys delete b, and create it again"

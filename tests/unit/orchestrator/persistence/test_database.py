@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import shutil
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -14,11 +13,11 @@ from sqlalchemy import event, func, or_, select
 from sqlalchemy.exc import IntegrityError, OperationalError
 from sqlalchemy.orm import Session
 
+from orchestrator.control.writes import Writes
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.resources import Resources
 from orchestrator.persistence.batch_models import Base, Job, JobQueue, RunRecord
 from orchestrator.persistence.gangs import Gangs
-from orchestrator.persistence.group_commit import GroupCommit
 from orchestrator.persistence.ownership import owner_of, record_owner
 from orchestrator.persistence.queries import ask_to_end
 from orchestrator.persistence.session import Database
@@ -47,8 +46,9 @@ class Crowd:
     """Callers that all wait while somebody else writes, then are carried out together."""
 
     def __init__(self, home: Path) -> None:
-        self.database, self.writing = Database.at(home), threading.Lock()
-        self.together = GroupCommit(self.database, self.writing)
+        nothing: Any = None  # additions ask neither the disk nor the loop
+        self.database = Database.at(home)
+        self.writes: Any = Writes(self.database, nothing, nothing)
         self.commits = 0
         event.listen(self.database.engine, "commit", self._count)
 
@@ -58,9 +58,9 @@ class Crowd:
     def call(self, *bodies: Callable[[Session], dict[str, Any]]) -> list[Any]:
         """What each call answered or raised."""
         with ThreadPoolExecutor(len(bodies)) as threads:
-            with self.writing:
-                calls = [threads.submit(self.together.call, body) for body in bodies]
-                while len(self.together._waiting) < len(bodies):
+            with self.writes.lock:
+                calls = [threads.submit(self.writes.gather, body) for body in bodies]
+                while len(self.writes._pending) < len(bodies):
                     pass
             return [call.exception() or call.result() for call in calls]
 
@@ -139,14 +139,6 @@ def test_only_the_definitions_used_last_are_remembered() -> None:
 
 
 @pytest.fixture
-def session(tmp_path: Path) -> Iterator[Session]:
-    database = Database.at(tmp_path)
-    with database.session() as session:
-        yield session
-    database.close()
-
-
-@pytest.fixture
 def run(tmp_path: Path) -> Run:
     return Store(tmp_path / "store").open().run("r")
 
@@ -217,6 +209,13 @@ def test_a_run_without_a_queue_exists_and_has_no_owner(session: Session, run: Ru
     assert known(recorded(session, run, submitted(session, "a", "lab", 1))) == ("lab", "key lab")
 
 
+def stops(session: Session) -> list[tuple[str | None, bool]]:
+    """Why each job is to end, and whether it was cancelled."""
+    session.commit()
+    found = session.scalars(select(Job).order_by(Job.id).execution_options(populate_existing=True))
+    return [(each.stop_reason, each.cancelled) for each in found]
+
+
 _CANCELLED, _TERMINATED, _LEFT = ("c", True), ("t", False), (None, False)
 
 
@@ -237,32 +236,22 @@ _CANCELLED, _TERMINATED, _LEFT = ("c", True), ("t", False), (None, False)
     ],
 )
 def test_an_array_is_asked_to_end_by_the_request_that_asked_its_children(
-    tmp_path: Path, children: list[str], requests: str, array: object, ends: list[object]
+    session: Session, children: list[str], requests: str, array: object, ends: list[object]
 ) -> None:
     """``c``: cancelled, ``t``: terminated; each is sent twice, the second time with another reason."""
-    database = Database.at(tmp_path)
-    with database.session() as session:
-        session.add(job("a", kind="array", status="PENDING", array_size=2))
-        session.flush()
-        for index, status in enumerate(children):
-            session.add(job(f"a:{index}", kind="container", parent="a", array_index=index, status=status))
-        session.commit()
-        for request in requests:
-            for reason in (request, "again"):
-                ask_to_end(session, or_(Job.id == "a", Job.parent == "a"), reason, cancel=request == "c")
-        session.commit()
-        found = session.scalars(select(Job).order_by(Job.id).execution_options(populate_existing=True))
-        assert [(each.stop_reason, each.cancelled) for each in found] == [array, *ends]
-    database.close()
+    session.add(job("a", kind="array", status="PENDING", array_size=2))
+    session.flush()
+    for index, status in enumerate(children):
+        session.add(job(f"a:{index}", kind="container", parent="a", array_index=index, status=status))
+    session.commit()
+    for request in requests:
+        for reason in (request, "again"):
+            ask_to_end(session, or_(Job.id == "a", Job.parent == "a"), reason, cancel=request == "c")
+    assert stops(session) == [array, *ends]
 
 
-def test_a_child_that_is_ended_alone_leaves_its_array_alone(tmp_path: Path) -> None:
-    database = Database.at(tmp_path)
-    with database.session() as session:
-        session.add_all([job("a", kind="array", status="PENDING"), job("a:0", parent="a"), job("a:1", parent="a")])
-        session.commit()
-        ask_to_end(session, Job.id == "a:1", "c", cancel=True)
-        session.commit()
-        found = session.scalars(select(Job).order_by(Job.id).execution_options(populate_existing=True))
-        assert [(each.stop_reason, each.cancelled) for each in found] == [_LEFT, _LEFT, _CANCELLED]
-    database.close()
+def test_a_child_that_is_ended_alone_leaves_its_array_alone(session: Session) -> None:
+    session.add_all([job("a", kind="array", status="PENDING"), job("a:0", parent="a"), job("a:1", parent="a")])
+    session.commit()
+    ask_to_end(session, Job.id == "a:1", "c", cancel=True)
+    assert stops(session) == [_LEFT, _LEFT, _CANCELLED]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
@@ -16,18 +15,12 @@ from orchestrator.domain.errors import RequestError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.job_counts import ArrayRole, JobCounts, note_rows
-from orchestrator.persistence.job_pages import Cursor, contains, count, read_page
+from orchestrator.persistence.job_pages import contains, count, place_of, read_page
+from orchestrator.persistence.keyset import Cursor
 from orchestrator.persistence.retention_rows import forget_jobs
 from orchestrator.persistence.session import Database
 
 QUEUES = [f"queue-{number}" for number in range(60)]
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database.at(tmp_path)
-    yield database
-    database.close()
 
 
 def job(name: str, created_at: int, queue: str = "default", status: str = "RUNNABLE", **more: Any) -> Job:
@@ -73,21 +66,21 @@ def test_pages_in_both_directions_are_the_whole_list_once(
     database: Database, queues: Sequence[str] | None, statuses: Sequence[str], most: int
 ) -> None:
     listed = fill(database, 300)
-    wanted = [each.id for each in listed if queues is None or each.queue in queues]
-    wanted = [each.id for each in listed if each.id in set(wanted) and (not statuses or each.status in statuses)]
+    expected = [each.id for each in listed if queues is None or each.queue in queues]
+    expected = [each.id for each in listed if each.id in set(expected) and (not statuses or each.status in statuses)]
     with database.session() as session:
         forth, page = [], read_page(session, most, queues, statuses)
         assert page.is_first
         forth.append(page)
         while not page.is_last:
-            page = read_page(session, most, queues, statuses, after=Cursor.of(page.jobs[-1]))
+            page = read_page(session, most, queues, statuses, after=place_of(page.jobs[-1]))
             assert not page.is_first
             forth.append(page)
-        assert [each for page in forth for each in ids(page.jobs)] == wanted
+        assert [each for page in forth for each in ids(page.jobs)] == expected
         assert all(len(page.jobs) == most for page in forth[:-1])
         back = []
         while not page.is_first and page.jobs:
-            page = read_page(session, most, queues, statuses, before=Cursor.of(page.jobs[0]))
+            page = read_page(session, most, queues, statuses, before=place_of(page.jobs[0]))
             back.append(page)
         assert [ids(page.jobs) for page in back] == [ids(page.jobs) for page in forth[-2::-1]]
 
@@ -98,16 +91,16 @@ def test_jobs_that_come_meanwhile_move_no_page_and_are_on_the_one_before(databas
         first = read_page(session, 30)
         session.add_all(job(f"new-{i}", 1000 + i) for i in range(40))
         session.flush()
-        second = read_page(session, 30, after=Cursor.of(first.jobs[-1]))
+        second = read_page(session, 30, after=place_of(first.jobs[-1]))
         assert ids(second.jobs) == listed[30:60]
         session.execute(delete(Job).where(Job.id == second.jobs[-1].id))
-        third = read_page(session, 30, after=Cursor.of(second.jobs[-1]))
+        third = read_page(session, 30, after=place_of(second.jobs[-1]))
         assert ids(third.jobs) == listed[60:] and third.is_last, "the place of a job that is gone is still a place"
-        beyond = read_page(session, 30, after=Cursor.of(third.jobs[-1]))
+        beyond = read_page(session, 30, after=place_of(third.jobs[-1]))
         assert (beyond.jobs, beyond.is_last) == ([], True)
-        newer = read_page(session, 30, before=Cursor.of(first.jobs[0]))
+        newer = read_page(session, 30, before=place_of(first.jobs[0]))
         assert ids(newer.jobs) == [f"new-{i}" for i in range(29, -1, -1)] and not newer.is_first
-        newest = read_page(session, 30, before=Cursor.of(newer.jobs[0]))
+        newest = read_page(session, 30, before=place_of(newer.jobs[0]))
         assert ids(newest.jobs) == [f"new-{i}" for i in range(39, 29, -1)] and newest.is_first
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,17 +12,8 @@ from orchestrator.domain.errors import RequestError
 from orchestrator.persistence import log_groups
 from orchestrator.persistence.batch_models import Node
 from orchestrator.persistence.own_models import LogGroup
-from orchestrator.persistence.session import Database
 from tests.support.definitions import container
 from tests.support.orchestrator.rows import job
-
-
-@pytest.fixture
-def session(tmp_path: Path) -> Iterator[Session]:
-    database = Database.at(tmp_path)
-    with database.session() as session:
-        yield session
-    database.close()
 
 
 def names(session: Session) -> list[str]:

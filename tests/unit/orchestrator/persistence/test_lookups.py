@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,13 +19,11 @@ ARRAY = "aaaaaaaa-0000-4000-8000-000000000000"
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    made = Database.at(tmp_path)
-    with made.session() as session:
+def database(database: Database) -> Database:
+    with database.session() as session:
         session.add(job(ARRAY, name="array", kind="array", array_size=10, created_at=5))
         session.add(job("bbbbbbbb-0000-4000-8000-000000000000", name="ant", created_at=5, queue="other"))
-    yield made
-    made.close()
+    return database
 
 
 def fill(database: Database, count: int) -> None:
@@ -92,7 +90,7 @@ def test_a_lookup_costs_the_same_with_many_jobs(database: Database, look: str) -
 def test_the_beginning_of_an_array_s_id_is_not_that_of_its_children(database: Database) -> None:
     fill(database, 20)
     statements: list[str] = []
-    event.listen(database.engine, "before_cursor_execute", lambda *told: statements.append(told[2]))
+    event.listen(database.engine, "before_cursor_execute", lambda *reported: statements.append(reported[2]))
     with database.session() as session:
         found = find_job(session, "aaaaaaaa")
         assert found is not None and found.id == ARRAY

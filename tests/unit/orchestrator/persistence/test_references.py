@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 from sqlalchemy import select, text
 
@@ -16,13 +13,6 @@ from tests.support.orchestrator.rows import job
 
 NOW = 1_000 * A_DAY
 QUEUES = {"short": A_DAY // 2, "kept": None}
-
-
-@pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    made = Database.at(tmp_path)
-    yield made
-    made.close()
 
 
 @pytest.mark.parametrize(

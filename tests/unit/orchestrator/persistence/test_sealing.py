@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.persistence.own_secrets import OwnSecrets
-from orchestrator.persistence.sealing import Seal, SealError
+from orchestrator.persistence.own_secrets import OwnSecrets, Seal, SealError
 from orchestrator.persistence.session import Database
 
 TEXT = "a-secret-of-the-bus"
@@ -52,7 +51,7 @@ def test_without_the_sealing_key_nothing_is_made_in_its_place(tmp_path: Path) ->
     Seal(tmp_path).make()
     assert f"{key}: does not open the secrets in the database: put back the file" in refused(tmp_path)
     key.write_bytes(b"no key")
-    assert f"{key}: is no sealing key" in refused(tmp_path)
+    assert f"{key}: is not a sealing key" in refused(tmp_path)
     key.write_bytes(text)
     key.chmod(0o644)
     assert f"{key}: has mode 0644" in refused(tmp_path)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -18,16 +16,14 @@ NAMES = [f"job-{number}" for number in range(5)]
 
 
 @pytest.fixture
-def database(tmp_path: Path) -> Iterator[Database]:
-    database = Database.at(tmp_path)
+def database(database: Database) -> Database:
     with database.session() as session:
         for name in NAMES:
             row = job(name, status=Status.STARTING)
             nodes = [Node(index=index, host="h", cpus=1.0, memory=64) for index in range(2)]
             row.attempts.append(Attempt(number=1, epoch=0, nodes=nodes, compute_environment="fake"))
             session.add(row)
-    yield database
-    database.close()
+    return database
 
 
 def updates(database: Database) -> tuple[list[tuple[str, int]], Any]:

@@ -78,10 +78,10 @@ def test_long_jobs_together_leave_the_head_the_cpus_of_its_compute_environment()
 
 def test_an_idle_queue_s_answer_has_a_place_or_a_problem() -> None:
     both = {"a - b": environment("a - b", max_cpus=2)}
-    asked = queue(environments=("a - b",))
-    placed = fit(gang(node(2)), asked, both, [host()])
+    requested = queue(environments=("a - b",))
+    placed = fit(gang(node(2)), requested, both, [host()])
     assert placed == Fit(Allocation("a - b", (on("a", 2, memory=100),)), None)
-    assert fit(gang(node(3)), asked, both, [host()]) == Fit(
+    assert fit(gang(node(3)), requested, both, [host()]) == Fit(
         None, "compute environment a - b has at most 2 CPUs; needs 1 node with 3 CPUs, 0 GPUs, 100 MiB in all"
     )
 
@@ -171,10 +171,12 @@ def test_what_is_reserved_on_other_hosts_is_nothing_to_a_queue() -> None:
 
 
 def test_hosts_that_are_away_are_taken_for_the_smallest_gang_alone() -> None:
-    away, there = replace(host("a", 1), away=True), host("b", 1)
+    away, present = replace(host("a", 1), unavailable=True), host("b", 1)
 
     def where(most: int | None, minimum: int = 2, count: int = 3) -> str | None:
-        found = place(gang(*[node()] * count, minimum=minimum), [away, there, replace(host("c", 1), away=True)], most)
+        found = place(
+            gang(*[node()] * count, minimum=minimum), [away, present, replace(host("c", 1), unavailable=True)], most
+        )
         return found and " ".join(each.host for each in found)
 
     assert [where(most) for most in (None, 3, 2, 1)] == ["b a", "b a", "b a", None]
@@ -182,11 +184,11 @@ def test_hosts_that_are_away_are_taken_for_the_smallest_gang_alone() -> None:
 
 
 def test_the_host_that_lacks_least_is_called_the_largest() -> None:
-    def largest(asked: tuple[float, int, int], *known: tuple[float, int, int]) -> str:
+    def largest(requested: tuple[float, int, int], *known: tuple[float, int, int]) -> str:
         hosts = [host(str(index), *each) for index, each in enumerate(known)]
-        said = never_fits(gang(node(*asked)), hosts)
-        assert said is not None
-        return said.partition("the largest host has ")[2]
+        message = never_fits(gang(node(*requested)), hosts)
+        assert message is not None
+        return message.partition("the largest host has ")[2]
 
     assert largest((2, 1, 50), (9, 0, 90), (1, 1, 10)) == "1 CPU, 1 GPU, 10 MiB"
     assert largest((2, 0, 99), (1, 0, 90), (2, 0, 10)) == "2 CPUs, 0 GPUs, 10 MiB"

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from orchestrator.domain.gang import Shape, gang_needs
 from orchestrator.domain.hosts import Host, Placement
 from orchestrator.domain.resources import Resources
 from orchestrator.scheduling.decisions import Start
-from orchestrator.scheduling.order import decayed
 from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare
 from tests.support.orchestrator.scheduling import (
     CAPACITY,
@@ -131,13 +128,6 @@ def test_in_a_share_priority_comes_before_age_and_jobs_without_one_have_their_ow
     usage = {("default", ""): 50.0, ("default", "s"): 10.0}
     decided = Pass([host()], [job("named", share="s"), job("none")], queues=[queue(policy=FAIR)], usage=usage)
     assert decided.started == "named:a none:a"
-
-
-@pytest.mark.parametrize(
-    ("age", "decay", "left"), [(0, 100, 800.0), (100, 100, 400.0), (300, 100, 100.0), (600, 0, 400.0), (-5, 100, 800.0)]
-)
-def test_use_halves_with_every_half_life(age: float, decay: int, left: float) -> None:
-    assert decayed(800.0, age, decay) == left
 
 
 # -- compute environments ---------------------------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def test_a_gang_never_fits_for_its_required_nodes_and_on_elastic_hosts_for_one_l
 
 
 def single(name: str, cpus: float = 4, gpus: int = 0, away: bool = False) -> Host:
-    return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), 8192, single=True, away=away)
+    return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), 8192, single=True, unavailable=away)
 
 
 @pytest.mark.parametrize(

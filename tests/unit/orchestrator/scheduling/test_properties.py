@@ -75,8 +75,8 @@ def check_pass(snapshot: Snapshot, decisions: Decisions) -> None:
         job = by_id[start.job]
         members = job.shape.nodes
         assert job.shape.minimum <= len(start.placements) <= len(members)
-        for placement, wanted in zip(start.placements, members, strict=False):
-            assert placement.resources == wanted
+        for placement, expected in zip(start.placements, members, strict=False):
+            assert placement.resources == expected
         assert start.compute_environment in snapshot.queues[job.queue].compute_environments
         assert snapshot.compute_environments[start.compute_environment].enabled
         assert {placement.host for placement in start.placements} <= {each.name for each in snapshot.hosts}

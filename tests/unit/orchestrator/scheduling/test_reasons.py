@@ -65,8 +65,8 @@ def test_while_an_engine_has_not_told_its_hosts_its_jobs_wait_and_say_so() -> No
     waiting, queues[1] = [job("ant", queue="both")], queue("both", environments=("quiet", "silent"))
     assert f"- {quiet.unknown}; " in Pass([], waiting, (), queues, [silent, quiet]).reason("ant"), "its first one"
     queues[1] = queue("both", environments=("silent", "there"))
-    asked = fit(gang(node(64)), queues[1], {"silent": silent, "there": there}, [host()])
-    assert (asked.allocation, asked.problem) == (None, None), "it is not refused"
+    requested = fit(gang(node(64)), queues[1], {"silent": silent, "there": there}, [host()])
+    assert (requested.allocation, requested.problem) == (None, None), "it is not refused"
 
 
 def test_the_reasons_of_all_refusing_compute_environments_are_reported_and_nobody_is_held_up() -> None:
@@ -139,8 +139,8 @@ def test_a_reason_says_that_room_is_in_pieces_and_names_the_last_gangs_that_it_w
         "2 CPUs, 0 GPUs, 16 GiB free"
     )
     held = [running("x", on("a", 2), ending=True), running("y", on("a", 2), timeout=700)]
-    said = "waits for jobs x (x-012345), y (y-012345) to end, at the latest at 2027-01-15 08:10:00 UTC: 4 of 4 CPUs short; "
-    assert said in Pass([host()], [job("ant", 4)], held).reason("ant")
+    message = "waits for jobs x (x-012345), y (y-012345) to end, at the latest at 2027-01-15 08:10:00 UTC: 4 of 4 CPUs short; "
+    assert message in Pass([host()], [job("ant", 4)], held).reason("ant")
     late = [running("x", on("a", 2), timeout=50)]
     assert "for job x (x-012345) to end: 2 of 4 CPUs short" in Pass([host()], [job("ant", 4)], late).reason("ant"), (
         "overdue"
@@ -202,5 +202,5 @@ def test_a_child_of_an_array_is_named_with_its_index_and_no_shortage_is_of_nothi
     assert (
         named("arr", "aa97f6c7-1111:12") == "arr:12 (aa97f6c7:12)" and named("ant", "aa97f6c7-1111") == "ant (aa97f6c7)"
     )
-    wanted, free = Resources(cpus=2, memory=1), Resources(cpus=1.996, memory=1)
-    assert shortage(wanted, free) == "less than 0.01 of 2 CPUs short"
+    expected, free = Resources(cpus=2, memory=1), Resources(cpus=1.996, memory=1)
+    assert shortage(expected, free) == "less than 0.01 of 2 CPUs short"

@@ -13,14 +13,14 @@ from tests.support.orchestrator.scheduling import NOW, environment, gang, host, 
 
 
 def reserved(
-    asked: Waiting,
+    requested: Waiting,
     held: Sequence[RunningGang],
     hosts: Sequence[Host] = (host("a", 4), host("b", 4)),
     environments: Sequence[ComputeEnvironment] = (environment(),),
 ) -> Reservation | None:
     known = {each.name: each for each in environments}
     free = FreeResources.of(Snapshot(NOW, hosts, known, {}, (), held, {}))
-    return reserve(asked, tuple(known), free, [holder_of(each, NOW, each.ending) for each in held])
+    return reserve(requested, tuple(known), free, [holder_of(each, NOW, each.ending) for each in held])
 
 
 def told(found: Reservation | None) -> tuple[float, str, str]:

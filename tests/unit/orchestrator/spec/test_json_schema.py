@@ -164,9 +164,9 @@ def test_secrets_become_those_of_the_job_definition() -> None:
 
 @pytest.mark.parametrize("kind", ["evaluate", "export", "record", "render"])
 def test_a_checkpoint_is_named_in_the_same_ways_by_every_kind_of_job(kind: str) -> None:
-    for wanted in (3, "best", "latest"):
-        job = {"name": "a", kind: {"run": "x", "checkpoint": wanted}}
-        assert getattr(validate(job, "job.yaml"), kind).checkpoint == wanted
+    for expected in (3, "best", "latest"):
+        job = {"name": "a", kind: {"run": "x", "checkpoint": expected}}
+        assert getattr(validate(job, "job.yaml"), kind).checkpoint == expected
         assert accepts(job)
     for wrong in (-1, "newest", True, 1.5):
         with pytest.raises(SpecError) as refused:

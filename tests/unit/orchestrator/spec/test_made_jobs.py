@@ -74,9 +74,9 @@ def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_
     assert (spec.nodes.max, spec.resources.gpus, spec.resources.cpus, spec.environment) == (1, 1, 4.0, {"NOTE": "a"})
     assert (spec.priority, spec.preemptible, spec.retry.attempts) == (0, True, 3)
     section = {"every": 1, "queue": "idle", "resources": {"cpus": 0.5, "memory": 512}, "retry": {"attempts": 1}}
-    wanted = wanted_of({**TRAINED, "evaluation": section})
-    assert wanted is not None
-    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", wanted), wanted, 40)
+    expected = wanted_of({**TRAINED, "evaluation": section})
+    assert expected is not None
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", expected), expected, 40)
     assert (spec.queue, spec.share, spec.resources.cpus, spec.resources.memory) == ("idle", None, 0.5, 512)
     assert (spec.resources.gpus, spec.retry.attempts) == (0, 1)
 

@@ -157,7 +157,7 @@ from orchestrator.spec.model import validate
 
 def submit(**train):
     base = {"task": "Cartpole", "worlds": 1, "iterations": 1, "algorithm": "hop"}
-    return validate({"name": "a", "train": {**base, **train}}, "job.yaml").train.given()
+    return validate({"name": "a", "train": {**base, **train}}, "job.yaml").train.overrides()
 
 print(submit(hop={"hops": 4}))
 for wrong in ({"hop": {"hopps": 4}}, {"hop": {"hops": "many"}}, {"ppo": {"epochs": 1}}, {"config": {"hop": {}}}):

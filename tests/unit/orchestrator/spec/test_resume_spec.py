@@ -151,8 +151,8 @@ def test_every_key_of_the_spec_is_in_one_of_the_tables() -> None:
 @pytest.mark.parametrize("key", [*APPLIED, *carried_keys()])
 def test_a_key_that_is_accepted_is_in_the_job_that_goes_on(key: str) -> None:
     named = next((section for section in ("nodes", "evaluation") if key.startswith(f"{section}.")), key)
-    given = json.dumps(setting_at(CARRIED, named))
-    text, expected, place = APPLIED.get(key) or (given, setting_at(CARRIED, key), carried(key))
+    values = json.dumps(setting_at(CARRIED, named))
+    text, expected, place = APPLIED.get(key) or (values, setting_at(CARRIED, key), carried(key))
     before, after = changed(kind_of(key), f"{named}={text}")
     _check_changes(RUN, before, after)
     assert place(*requests_of(before)) != expected and place(*requests_of(after)) == expected
@@ -187,7 +187,7 @@ def accepted_value(name: str, key: str) -> str:
         except Exception:
             continue
         assert spec.train is not None
-        if spec.train.given().get(key) is not None:
+        if spec.train.overrides().get(key) is not None:
             return probe
     raise AssertionError(f"no probe is a value of train.{name}.{key}: add one")
 
@@ -278,6 +278,6 @@ def test_two_options_for_the_same_setting_are_refused() -> None:
     assert Changes(assignments=("train.iterations=3",), nodes=4).all() == ["train.iterations=3", "nodes=4"]
     assert Changes(assignments=("nodes=2",)).all() == ["nodes=2"]
     for assignment in ("nodes=2", "nodes.max=2"):
-        said = rf"--set {assignment}: --nodes 4 sets the number of nodes; give one of them"
-        with pytest.raises(ClientError, match=said):
+        message = rf"--set {assignment}: --nodes 4 sets the number of nodes; give one of them"
+        with pytest.raises(ClientError, match=message):
             Changes(assignments=(assignment,), nodes=4).all()
