@@ -214,7 +214,7 @@ def test_code_outside_the_subset_is_refused_with_line_and_reason(body: str, reas
     ("body", "reason"),
     [
         ("if a > 0:\n            return 1.5", "line 10: a function that returns a float or None"),
-        ("if a > 0:\n            return\n        return 2", "line 12: a function that returns an int or None"),
+        ("if a > 0:\n            return\n        return 2", "line 13: a function that returns None or an int"),
         (
             "if a > 0:\n            return [a, 2]\n        return None",
             "line 13: a function that returns a list of 2 or None",
@@ -309,7 +309,7 @@ CORPUS = {path.stem: path.read_text() for path in sorted((Path(__file__).parent 
 OUTSIDE = {
     "global_state": "line 7: the global variable last_progress, which keeps its value: such functions run in Python workers",
     "numpy_arrays": "line 7: numpy.array(): such functions run in Python workers",
-    "stateful_class": "line 18: an object of the class Reward: such functions run in Python workers",
+    "stateful_class": "line 18: the class Reward: such functions run in Python workers",
 }
 DRAWN = 250
 
