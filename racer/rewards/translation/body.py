@@ -311,11 +311,10 @@ class Module(Body):
             except Outside as outside:
                 if isinstance(statement, ast.Import | ast.ImportFrom):
                     raise
-                nodes = [] if isinstance(statement, ast.FunctionDef) else ast.walk(statement)
-                stored = [
-                    each.id for each in nodes if isinstance(each, ast.Name) and not isinstance(each.ctx, ast.Load)
-                ]
-                self.names |= dict.fromkeys([*stored, *([] if nodes else [statement.name])], outside)
+                nodes = [each for each in ast.walk(statement) if isinstance(each, ast.Name)]
+                stored = [each.id for each in nodes if not isinstance(each.ctx, ast.Load)]
+                name = getattr(statement, "name", "")  # of a function
+                self.names |= dict.fromkeys([name] if name else stored, outside)
         for node in ast.walk(tree):
             for name in node.names if isinstance(node, ast.Global) else ():
                 self.names[name] = Outside(node, f"the global variable {name}, which keeps its value")

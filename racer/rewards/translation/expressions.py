@@ -291,8 +291,8 @@ class Expressions:
         if len(parts) == 1:
             return first
         rest = partial(self._either, node, parts[1:])
-        ways = (rest, lambda: first) if isinstance(node.op, ast.And) else (lambda: first, rest)
-        return self.choose(self.truth(first, node), *ways, node=node)
+        one, other = (rest, lambda: first) if isinstance(node.op, ast.And) else (lambda: first, rest)
+        return self.choose(self.truth(first, node), one, other, node)
 
     def _IfExp(self, node: ast.IfExp) -> Value:
         one, other = partial(self.expression, node.body), partial(self.expression, node.orelse)

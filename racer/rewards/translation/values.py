@@ -19,7 +19,7 @@ ORDER = ("bool", "int", "float")
 """Kinds of numbers, from the narrowest on; a variable has the widest of its values."""
 C_TYPES = {"bool": "bool", "int": "long long", "float": "double", "text": "int"}
 LONGEST_GROUP = 16
-"""Items of a list or tuple that is kept in variables of its own, one each."""
+"""Longest list or tuple whose items each have a variable."""
 
 
 class Outside(Exception):
@@ -102,7 +102,7 @@ def is_known(value: Value) -> bool:
 
 
 def is_table(value: Value) -> bool:
-    """Whether a list or tuple is known and too long for variables of its own."""
+    """Whether a list or tuple is known and too long for a variable per item."""
     return isinstance(value, list | tuple) and _count(value) > LONGEST_GROUP and is_known(value)
 
 
