@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import inspect
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -94,7 +93,12 @@ class Body(Calls):
 
     def apply(self, function: Function, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST) -> Value:
         """The result of a function of the file, which is translated for the shapes of these arguments."""
-        values = self._bound(function, arguments, named, node)
+        try:
+            bound = function.signature.bind(*arguments, **named)
+        except TypeError:
+            raise Outside(node, f"a call of {function.name}() that does not fit its parameters") from None
+        bound.apply_defaults()
+        values = bound.arguments
         if function.node in self.program.running or len(self.program.running) > _DEEPEST:
             raise Outside(node, f"{function.name}(), which calls itself")
         shapes = {name: shape_of(value) for name, value in values.items()}
@@ -116,31 +120,6 @@ class Body(Calls):
         self.emit(f"{called}({', '.join([*codes, *names])});")
         self.may_fail = True
         return rebuilt(result, iter(names))
-
-    def _bound(
-        self, function: Function, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST
-    ) -> dict[str, Value]:
-        """The arguments of a call by the names of the function's parameters."""
-        found, kinds = function.node.args, inspect.Parameter
-        if found.vararg or found.kwarg:
-            raise Outside(function.node, "a function with * or **")
-        if getattr(function.node, "decorator_list", None):
-            raise Outside(function.node, "a decorated function")
-        parameters = [
-            kinds(each.arg, kind, default=function.defaults.get(each.arg, kinds.empty))
-            for kind, group in (
-                (kinds.POSITIONAL_ONLY, found.posonlyargs),
-                (kinds.POSITIONAL_OR_KEYWORD, found.args),
-                (kinds.KEYWORD_ONLY, found.kwonlyargs),
-            )
-            for each in group
-        ]
-        try:
-            bound = inspect.Signature(parameters).bind(*arguments, **named)
-        except TypeError:
-            raise Outside(node, f"a call of {function.name}() that does not fit its parameters") from None
-        bound.apply_defaults()
-        return bound.arguments
 
     # statements
 

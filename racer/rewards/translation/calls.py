@@ -128,32 +128,16 @@ class Calls(Expressions):
         if name == "py_empty":
             self.emit(f"py_fail({self.at(node, EMPTY)});")
             return None
-        options = {f"py_{each.arg}": each.value for each in node.keywords}
-        first = node.args[0] if node.args else None
-        if name == "len" and isinstance(first, ast.GeneratorExp):
-            raise Outside(node, "len() in this form")
-        if name == "len" and isinstance(first, ast.ListComp):
-            counting = ast.copy_location(ast.GeneratorExp(ast.Constant(1), first.generators), first)
+        if name in _LOOPS:
+            return self._over_items(name, node)
+        if name == "len" and node.args and isinstance(node.args[0], ast.ListComp):
+            counting = ast.copy_location(ast.GeneratorExp(ast.Constant(1), node.args[0].generators), node)
             return self.reduced("sum", node, counting, {})
-        if name in _LOOPS and first and (options or isinstance(first, _Comprehension)):
-            more = {"py_start": node.args[1]} if name == "sum" and len(node.args) == 2 else {}
-            if len(node.args) > 1 + len(more) or set(options) - {each.arg for each in _LOOPS[name].args.args}:
-                raise Outside(node, f"{name}() in this form")
-            source = first if isinstance(first, _Comprehension) else self.expression(first)
-            return self.reduced(
-                name, node, source, {key: self.expression(each) for key, each in (options | more).items()}
-            )
         if node.keywords:
             raise Outside(node, f"{name}() with {node.keywords[0].arg}=")
         arguments = [self.expression(each) for each in node.args]
-        module, _, function = name.rpartition(".")
-        if is_known(arguments) and (name in _OF_KNOWN or module == "math"):
-            try:
-                value = getattr(math if module else builtins, function)(*arguments)
-                if is_known(value) and fits(value):
-                    return value
-            except (ValueError, TypeError, ArithmeticError, AttributeError):
-                pass  # the error is reported where the function runs
+        if (value := _of_known(name, arguments)) is not ...:
+            return value
         method = getattr(self, f"_{name}", None) if name in BUILTINS else None
         if method is None:
             return self._mathematical(name, arguments, node)
@@ -162,6 +146,22 @@ class Calls(Expressions):
         except TypeError:
             raise Outside(node, f"{name}() with {counted(len(arguments), 'argument')}") from None
         return method(node, *arguments)
+
+    def _over_items(self, name: str, node: ast.Call) -> Value:
+        """``sum``, ``any``, ``all``, ``min`` or ``max``."""
+        options = {f"py_{each.arg}": self.expression(each.value) for each in node.keywords}
+        arguments = [each if isinstance(each, _Comprehension) else self.expression(each) for each in node.args]
+        if not options and (value := _of_known(name, arguments)) is not ...:
+            return value
+        if name == "sum" and len(arguments) == 2:
+            options["py_start"] = arguments.pop()
+        is_extreme = name in ("min", "max") and not options
+        items = arguments if len(arguments) > 1 else arguments[0] if arguments else None
+        if is_extreme and isinstance(items, list | tuple) and not any(isinstance(each, ast.AST) for each in items):
+            return self._extreme(name, node, items)
+        if len(arguments) != 1 or set(options) - {each.arg for each in _LOOPS[name].args.args}:
+            raise Outside(node, f"{name}() in this form")
+        return self.reduced(name, node, items, options)
 
     def reduced(self, name: str, node: ast.AST, source: Any, options: dict[str, Value]) -> Value:
         """The result of one of :data:`_LOOPS`, whose loop becomes those of a generator where ``source`` is one."""
@@ -208,14 +208,24 @@ class Calls(Expressions):
 
     def function(self, name: str, node: ast.FunctionDef | ast.Lambda, scope: Any) -> Function:
         """A function that is defined here, with the defaults of its parameters."""
-        found = node.args
-        names = [each.arg for each in (*found.posonlyargs, *found.args)]
-        defaults = dict(zip(reversed(names), map(self.expression, reversed(found.defaults)), strict=False))
-        for each, default in zip(found.kwonlyargs, found.kw_defaults, strict=True):
-            defaults |= {each.arg: self.expression(default)} if default else {}
+        found, kinds = node.args, inspect.Parameter
+        places = [*found.posonlyargs, *found.args]
+        defaults = dict(zip(reversed(places), map(self.expression, reversed(found.defaults)), strict=False))
+        defaults |= {
+            each: self.expression(default)
+            for each, default in zip(found.kwonlyargs, found.kw_defaults, strict=True)
+            if default
+        }
         if not is_known([*defaults.values()]):
             raise Outside(node, "a default that is no constant")
-        return Function(name, node, scope, defaults)
+        if found.vararg or found.kwarg or getattr(node, "decorator_list", None):
+            raise Outside(node, "a decorated function, or one with * or **")
+        kind: dict[ast.arg, Any] = dict.fromkeys(places, kinds.POSITIONAL_OR_KEYWORD)
+        kind |= dict.fromkeys(found.posonlyargs, kinds.POSITIONAL_ONLY) | dict.fromkeys(
+            found.kwonlyargs, kinds.KEYWORD_ONLY
+        )
+        parameters = [kinds(each.arg, of, default=defaults.get(each, kinds.empty)) for each, of in kind.items()]
+        return Function(name, node, scope, inspect.Signature(parameters))
 
     def _Lambda(self, node: ast.Lambda) -> Value:
         return self.function("lambda", node, self)
@@ -348,24 +358,10 @@ class Calls(Expressions):
             lambda index: found.item(Number("int", f"({last} - 1 - {self.code(index, 'int')})")),
         )
 
-    def _min(self, node: ast.Call, *values: Value) -> Value:
-        return self._extremes("min", node, values)
-
-    def _max(self, node: ast.Call, *values: Value) -> Value:
-        return self._extremes("max", node, values)
-
-    def _extremes(self, name: str, node: ast.Call, values: Sequence[Value]) -> Value:
-        items = values[0] if len(values) == 1 else values
-        if not isinstance(items, list | tuple) or (is_known(items) and len(items) > LONGEST_GROUP):
-            return self.reduced(name, node, items, {})
-        if not items:
-            raise Outside(node, f"{name}() of nothing")
-        return self._extreme(name, node, items)
-
     def _extreme(self, name: str, node: ast.AST, items: Sequence[Value]) -> Value:
         """The least or greatest of a few numbers."""
-        if is_known(items):
-            return getattr(builtins, name)(items)
+        if not items:
+            raise Outside(node, f"{name}() of nothing")
         best = items[0]
         for item in items[1:]:
             kind = joined(Number(self.kind(best, node)), Number(self.kind(item, node))).kind
@@ -374,11 +370,14 @@ class Calls(Expressions):
         self.kind(best, node)
         return best
 
-    def _sum(self, node: ast.Call, value: Value, start: Value = 0) -> Value:
-        return self.reduced("sum", node, value, {"py_start": start})
 
-    def _any(self, node: ast.Call, value: Value) -> Value:
-        return self.reduced("any", node, value, {})
-
-    def _all(self, node: ast.Call, value: Value) -> Value:
-        return self.reduced("all", node, value, {})
+def _of_known(name: str, arguments: Sequence[Value]) -> Value:
+    """Python's own result of a function of known values; ``...``: they are not known, or it has none."""
+    module, _, function = name.rpartition(".")
+    if not is_known(arguments) or not (name in _OF_KNOWN or module == "math"):
+        return ...
+    try:
+        value = getattr(math if module else builtins, function)(*arguments)
+    except (ValueError, TypeError, ArithmeticError, AttributeError):
+        return ...  # the error is reported where the function runs
+    return value if is_known(value) and fits(value) else ...

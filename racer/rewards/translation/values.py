@@ -8,6 +8,7 @@ and tuples in which they stand; where nothing has to be held, the value itself.
 from __future__ import annotations
 
 import ast
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -74,13 +75,13 @@ class Function:
         name: Its name.
         node: Where it is defined.
         scope: The function or module around it, whose variables it sees.
-        defaults: Known values of parameters that a call may leave out.
+        signature: Its parameters, with known values of those that a call may leave out.
     """
 
     name: str
     node: Any
     scope: Any = field(repr=False)
-    defaults: Mapping[str, Value] = field(repr=False, compare=False)
+    signature: inspect.Signature = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
