@@ -179,7 +179,7 @@ def test_deepracer_utils_reads_a_race_with_the_training_beside_it_from_what_the_
     task = Racer(configured(RacerConfig, {"track": "oval", **race_changes({"seconds": 4.0})}), 3, seed=5)
     laps = Laps(task)
     (policy,) = load_policies(checkpoint, "cpu", 1)
-    played = play([task], policy, alone(), inspect=laps.note)
+    played = play([task], policy, alone(), look=laps.note)
     laps.race(played, rules_of({}), 5, checkpoint.manifest).write(run.evaluations / "00000006-e1-job")
     _copy(run.path, "00000006-e1-job", tmp_path / "race", quiet=True)
     log = DeepRacerLog(str(tmp_path / "race"))

@@ -16,7 +16,7 @@ from orchestrator.spec.changes import override
 from orchestrator.spec.compile import compile_definition, long_texts
 from orchestrator.spec.kept_files import changes_with_files, with_files
 from orchestrator.spec.model import validate
-from racer.control.track_orders import send
+from racer.control.track_orders import carry_out
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import IN_DEFINITION, LARGEST, digest_of
 from tests.support.refusals import refusal
@@ -218,7 +218,7 @@ def test_a_reward_function_is_tried_on_the_job_s_own_track(directory: Path) -> N
 def test_a_track_of_the_store_is_tried_where_the_store_is_here_and_noted_where_it_is_not(directory: Path) -> None:
     (directory / "mine.py").write_text(FAR)
     store = Store(directory / "store").open()
-    send(
+    carry_out(
         {
             "action": "make",
             "name": "short",

@@ -52,7 +52,7 @@ def drive(gain: float = 1.0, learns: bool = False, **section: Any) -> tuple[Race
     changes = race_changes({"track": "oval", **section})
     task = Racer(configured(RacerConfig, {"track": "chicane", **changes}), section.get("trials", 3), seed=5)
     laps = Laps(task)
-    played = play([task], Driver(task, gain, learns), alone(), inspect=laps.note)
+    played = play([task], Driver(task, gain, learns), alone(), look=laps.note)
     return task, played, laps.race(played, rules_of(section), 5)
 
 
@@ -169,7 +169,7 @@ def test_a_choice_is_identified_by_its_number(tmp_path: Path) -> None:
     laps = Laps(task)
     driver = Driver(task)
     driver.act = lambda observations: torch.ones(1, 1)
-    race = laps.race(play([task], driver, alone(), inspect=laps.note), rules_of({}), 5)
+    race = laps.race(play([task], driver, alone(), look=laps.note), rules_of({}), 5)
     first = dict(zip(SIM_TRACE_COLUMNS, list(race.trials[0].sim_trace(0))[2].split(","), strict=True))
     last = list(race.trials[0].sim_trace(0))[-1].split(",")
     assert (first["action"], first["throttle"]) == ("1", "1.00")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import fields, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -106,7 +106,7 @@ def test_a_drawn_track_has_the_requested_measures() -> None:
 
 
 @pytest.mark.parametrize(
-    ("request", "words"),
+    ("measures", "words"),
     [
         ({"length": 3.0}, "length 3 m: expected 4 to 1000 m"),
         ({"length": math.nan}, "length nan m: expected 4"),
@@ -120,8 +120,8 @@ def test_a_drawn_track_has_the_requested_measures() -> None:
         ({"length": 8.0, "roughness": 1.0}, "seed 1: none of 200 curves fits"),
     ],
 )
-def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(request: dict[str, object], words: str) -> None:
-    assert words in refusal(make_random, 1, error=BadTrack, **request)
+def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(measures: dict[str, object], words: str) -> None:
+    assert words in refusal(make_random, 1, error=BadTrack, **measures)
 
 
 def test_a_preset_that_is_too_short_for_its_width_says_how_wide_it_may_be() -> None:
@@ -346,7 +346,7 @@ def test_an_irregular_file_is_refused(tmp_path: Path) -> None:
 
 
 @settings(max_examples=150, deadline=None)
-@fields(place=st.integers(0, 200), value=st.binary(min_size=1, max_size=4))
+@given(place=st.integers(0, 200), value=st.binary(min_size=1, max_size=4))
 def test_damaged_bytes_give_a_track_or_one_line(place: int, value: bytes) -> None:
     data = to_bytes(OVAL)
     try:
