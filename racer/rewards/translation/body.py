@@ -316,7 +316,7 @@ class Module(Body):
 
     def _define(self, statement: ast.stmt) -> None:
         if isinstance(statement, ast.ClassDef):
-            self.names[statement.name] = Outside(statement, f"the class {statement.name}")
+            self.names[statement.name] = Outside(statement, f"an object of the class {statement.name}")
         elif isinstance(
             statement, ast.FunctionDef | ast.Import | ast.ImportFrom | ast.Assign | ast.AnnAssign | ast.Expr
         ):

@@ -309,7 +309,7 @@ CORPUS = {path.stem: path.read_text() for path in sorted((Path(__file__).parent 
 OUTSIDE = {
     "global_state": "line 7: the global variable last_progress, which keeps its value: such functions run in Python workers",
     "numpy_arrays": "line 7: numpy.array(): such functions run in Python workers",
-    "stateful_class": "line 18: the class Reward: such functions run in Python workers",
+    "stateful_class": "line 18: an object of the class Reward: such functions run in Python workers",
 }
 DRAWN = 250
 
