@@ -31,7 +31,7 @@ PLUGIN = Plugin(
         "GET /tracks/{name}/outline.svg",
         "GET /tracks/{name}/picture.png",
     ),
-    routers=("racer.control.league_routes:router", "racer.control.track_routes:router"),
+    routers=("racer.control.leagues:router", "racer.control.track_routes:router"),
     pages=("racer.control.track_pages:router", "racer.control.league_pages:router"),
     navigation=(("League", "/leagues"), ("Tracks", "/tracks")),
     templates="racer.control",

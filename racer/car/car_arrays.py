@@ -142,15 +142,15 @@ def ahead_of(pose: wp.vec3, forward: float, sideward: float) -> wp.vec2:
 @wp.func
 def from_car(pose: wp.vec3, point: wp.vec2) -> wp.vec2:
     """A point as the car sees it from its front: how far ahead and how far to the left [m]."""
-    away = point - ahead_of(pose, FRONT, 0.0)
+    offset = point - ahead_of(pose, FRONT, 0.0)
     cosine = wp.cos(pose[2])
     sine = wp.sin(pose[2])
-    return wp.vec2(away[0] * cosine + away[1] * sine, away[1] * cosine - away[0] * sine)
+    return wp.vec2(offset[0] * cosine + offset[1] * sine, offset[1] * cosine - offset[0] * sine)
 
 
 @wp.func
 def put_car(world: int, worlds: WorldArrays, robot: RobotArrays, car: CarArrays):
-    """Bring the joints of a world to where its car is."""
+    """Set a world's joints to its car's pose."""
     pose = car.poses[world]
     corner = car.road.corner[car.tracks[world]]
     worlds.joint_q[world, robot.coordinates[X]] = corner[0] + pose[0]
@@ -246,8 +246,8 @@ def overlap(first: wp.vec3, first_half: wp.vec2, second: wp.vec3, second_half: w
 
 
 @wp.func
-def look_round(world: int, car: CarArrays, begin: int, many: int):
-    """Find where the car is on its track; the nearest segment is one of ``many`` from row ``begin`` on."""
+def locate_car(world: int, car: CarArrays, begin: int, many: int):
+    """Locate the car on its track; the nearest segment is one of ``many`` from row ``begin`` on."""
     track = car.tracks[world]
     pose = car.poses[world]
     road = car.road
@@ -268,11 +268,11 @@ def look_round(world: int, car: CarArrays, begin: int, many: int):
     if not at_end and place.distance + wp.length(wp.vec2(FRONT + 0.5 * WHEELBASE, 0.5 * GAUGE)) >= road.clear[track]:
         wheels = wheels_on_road(car, track, pose)
     car.wheels[world] = wheels
-    look_at_obstacles(world, car)
+    locate_obstacles(world, car)
 
 
 @wp.func
-def look_at_obstacles(world: int, car: CarArrays):
+def locate_obstacles(world: int, car: CarArrays):
     """Find the obstacles before and behind the car, and whether it touches one."""
     track = car.tracks[world]
     least, greatest = float(wp.inf), float(-1.0)
@@ -301,20 +301,20 @@ def gap_to(world: int, car: CarArrays, number: int) -> float:
     On an open track that to an obstacle behind is more than the track's length, so that all that are ahead come first.
     """
     track = car.tracks[world]
-    there = car.obstacle_along[track, number]
+    position = car.obstacle_along[track, number]
     if car.backwards[world]:
-        there = car.road.length[track] - there
-    return around(there - car.along[world], car.road.period[track])
+        position = car.road.length[track] - position
+    return around(position - car.along[world], car.road.period[track])
 
 
 @wp.func
 def follow_car(world: int, car: CarArrays):
-    """After a control step: where the car is now, and how it has come on."""
+    """Update the car's place and its progress after a control step."""
     track = car.tracks[world]
     front = car.fronts[world]
     along = car.along[world]
     window = car.road.window[track]
-    look_round(world, car, car.rows[world] - window, 2 * window + 1)
+    locate_car(world, car, car.rows[world] - window, 2 * window + 1)
     moved = advance(car.road, track, along, car.along[world])
     car.moved[world] = moved
     car.travelled[world] = car.travelled[world] + moved
@@ -332,7 +332,7 @@ def follow_car(world: int, car: CarArrays):
 @wp.func
 def begin_car(world: int, car: CarArrays):
     """Finds the place of a car that was put down: searches the whole track, and forgets its past."""
-    look_round(world, car, 0, car.road.count[car.tracks[world]])
+    locate_car(world, car, 0, car.road.count[car.tracks[world]])
     car.commands[world] = wp.vec2(0.0, 0.0)
     car.travelled[world] = 0.0
     car.moved[world] = 0.0

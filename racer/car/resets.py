@@ -15,7 +15,7 @@ from racer.car.car_arrays import (
     X,
     Y,
     ahead_of,
-    look_round,
+    locate_car,
     overlap,
     progress_of,
     put_car,
@@ -132,7 +132,7 @@ def put_back(world: int, worlds: WorldArrays, robot: RobotArrays, car: CarArrays
 @wp.func
 def go_on(world: int, car: CarArrays):
     """Updates the progress of a car that was put back: it loses the distance that it has to drive again."""
-    look_round(world, car, 0, car.road.count[car.tracks[world]])
+    locate_car(world, car, 0, car.road.count[car.tracks[world]])
     car.commands[world] = wp.vec2(0.0, 0.0)
     car.travelled[world] = car.travelled[world] - car.set_back[world]
     car.moved[world] = 0.0

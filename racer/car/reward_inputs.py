@@ -68,10 +68,10 @@ class CameraView:
 @wp.func
 def in_image(view: CameraView, point: wp.vec3) -> bool:
     """Whether the camera sees a point ahead of the car's middle, to the left, above the road [m], where nothing hides it."""
-    away = point - view.place
-    depth = away[0] * wp.cos(view.pitch) - away[2] * wp.sin(view.pitch)
-    up = away[0] * wp.sin(view.pitch) + away[2] * wp.cos(view.pitch)
-    return depth > 0.0 and wp.abs(away[1]) <= depth * view.wide and wp.abs(up) <= depth * view.high
+    offset = point - view.place
+    depth = offset[0] * wp.cos(view.pitch) - offset[2] * wp.sin(view.pitch)
+    up = offset[0] * wp.sin(view.pitch) + offset[2] * wp.cos(view.pitch)
+    return depth > 0.0 and wp.abs(offset[1]) <= depth * view.wide and wp.abs(up) <= depth * view.high
 
 
 @wp.func
@@ -86,8 +86,8 @@ def sees_box(view: CameraView, pose: wp.vec3, box: wp.vec3, half: wp.vec2) -> bo
             forward = half[0] * (2.0 * float(corner % 2) - 1.0)
             sideward = half[1] * (2.0 * float((corner / 2) % 2) - 1.0)
             up = HALF_HEIGHT * 2.0 * float(corner / 4)
-        away = ahead_of(box, forward, sideward) - wp.vec2(pose[0], pose[1])
-        if in_image(view, wp.vec3(away[0] * cosine + away[1] * sine, away[1] * cosine - away[0] * sine, up)):
+        offset = ahead_of(box, forward, sideward) - wp.vec2(pose[0], pose[1])
+        if in_image(view, wp.vec3(offset[0] * cosine + offset[1] * sine, offset[1] * cosine - offset[0] * sine, up)):
             seen = True
     return seen
 
@@ -102,7 +102,7 @@ def as_number(truth: bool) -> float:
 
 
 @wp.kernel
-def _tell(
+def _report(
     car: CarArrays,
     view: CameraView,
     sides: wp.array2d[wp.float32],
@@ -270,7 +270,7 @@ class Racing:
     def advance(self) -> None:
         """After a control step."""
         inputs = [self._cars, self._view, self._sides, self._seconds, self.arrays]
-        wp.launch(_tell, dim=self._worlds, inputs=inputs, device=self._device)
+        wp.launch(_report, dim=self._worlds, inputs=inputs, device=self._device)
 
     def settle(self) -> None:
         """Nothing: the function of a car that was just placed reads it after the first step."""

@@ -47,7 +47,7 @@ CAR = """<mujoco model="racer"><compiler angle="radian"/><worldbody><body name="
   </body>
 </body></worldbody>
 <actuator><position joint="steering" kp="1"/><velocity joint="speed" kv="1"/></actuator></mujoco>"""
-"""The car as MJCF. Nothing in it touches anything: a rule of its own moves it, :mod:`racer.car.bicycle`."""
+"""The car as MJCF. Nothing in it touches anything; the kinematic model of :mod:`racer.car.bicycle` moves it."""
 
 
 def add_scenery(builder: newton.ModelBuilder, circuit: Circuit) -> None:
@@ -96,8 +96,8 @@ def _roads(track: Track) -> list[tuple[Floats, Floats]]:
 
 def _towards(start: Floats, end: Floats) -> Floats:
     """From ``start`` (N, 2) as far as a border is wide, in the direction of ``end``."""
-    away = end - start
-    step: Floats = BORDER_WIDTH * away / norm(away)[:, None]
+    offset = end - start
+    step: Floats = BORDER_WIDTH * offset / norm(offset)[:, None]
     return step
 
 

@@ -125,7 +125,7 @@ class Racer(DeclaredTask):
             return {}
         with on_torch_stream(self.device):
             found = self.sensors["race"].reward.failures()
-        return {told: (each.count, self.first_world + each.car) for told, each in found.items()}
+        return {message: (each.count, self.first_world + each.car) for message, each in found.items()}
 
     def read_mishap(self, code: int) -> tuple[int, str] | None:
         """As :meth:`Task.read_mishap`, with the error of the reward function."""

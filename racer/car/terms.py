@@ -38,9 +38,9 @@ STARTED = wp.constant(0.5)
 @wp.func
 def choose(world: int, worlds: WorldArrays, robot: RobotArrays, car: CarArrays, choice: int):
     """Ask for the steering and the speed of a choice."""
-    asked = car.choices[wp.clamp(choice, 0, car.choices.shape[0] - 1)]
-    worlds.controls[world, robot.actuators[STEERING]] = asked[0]
-    worlds.controls[world, robot.actuators[WHEELS]] = asked[1]
+    target = car.choices[wp.clamp(choice, 0, car.choices.shape[0] - 1)]
+    worlds.controls[world, robot.actuators[STEERING]] = target[0]
+    worlds.controls[world, robot.actuators[WHEELS]] = target[1]
 
 
 @wp.func

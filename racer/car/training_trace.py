@@ -109,14 +109,14 @@ class TrainingTrace:
         self._open: list[list[np.ndarray[Any, Any]] | None] = [[_started(row)] for row in start]
         """Of each car the rows of its running episode; None: it began before anything was noted."""
         self._clocks: list[list[float]] = [[] for _ in range(cars)]
-        self._begun = False
+        self._started = False
         """Whether there is a file of an episode that ended."""
         self._folder.mkdir(parents=True, exist_ok=True)
         self._unfinished.mkdir(exist_ok=True)
         if iteration:
             self._load(iteration)
         for path in self._folder.iterdir():
-            if (found := _FILE.fullmatch(path.name)) and (int(found[1]) >= iteration or not self._begun):
+            if (found := _FILE.fullmatch(path.name)) and (int(found[1]) >= iteration or not self._started):
                 path.unlink()
         write_documents(run.path, documents)
         task.watch(self._fill, by="sim_trace")
@@ -156,7 +156,7 @@ class TrainingTrace:
             self._append(car, rows[since:, car], clock)
         if not ended:
             return
-        number = iteration if self._begun else 0
+        number = iteration if self._started else 0
         lines = [",".join(SIM_TRACE_COLUMNS)]
         for episode, (_, car, steps, clocks, cause) in enumerate(sorted(ended, key=lambda each: each[:2])):
             is_last = number == 0 and episode == len(ended) - 1
@@ -169,11 +169,11 @@ class TrainingTrace:
                 control_hz=self._task.config.control_hz,
             )
         write_atomic(self._folder / f"{number}-iteration.csv", ("\n".join(lines) + "\n").encode())
-        self._begun = True
+        self._started = True
 
     def keep(self, iteration: int) -> None:
         """Keep the unfinished episodes for a checkpoint after ``iteration`` iterations. Raises OSError."""
-        content: dict[str, Any] = {"begun": np.array(self._begun)}
+        content: dict[str, Any] = {"begun": np.array(self._started)}
         for car, rows in enumerate(self._open):
             if rows is not None:
                 content |= {f"rows_{car}": np.concatenate(rows), f"clocks_{car}": np.array(self._clocks[car])}
@@ -199,7 +199,7 @@ class TrainingTrace:
             print(
                 f"warning: {path} can't be read ({why}); its unfinished episodes are left out of the trace", flush=True
             )
-        self._begun = bool(content.get("begun", (self._folder / "0-iteration.csv").exists()))
+        self._started = bool(content.get("begun", (self._folder / "0-iteration.csv").exists()))
         for car in range(len(self._open)):
             rows = content.get(f"rows_{car}")
             self._open[car] = None if rows is None else [rows]

@@ -68,9 +68,9 @@ def race_or_evaluate(
     if not race:
         evaluate(**given)
         return
-    for there in () if output is None else (output / each for each in (SIM_TRACE, *BESIDE)):
-        if there.exists():
-            raise UsageError(f"-o {output}: {there} exists; name another directory")
+    for existing in () if output is None else (output / each for each in (SIM_TRACE, *BESIDE)):
+        if existing.exists():
+            raise UsageError(f"-o {output}: {existing} exists; name another directory")
     section = {
         "seed": given["seed"],
         "trials": trials,

@@ -126,7 +126,7 @@ def create(
     if as_json:
         echo_json(found, indent=1)
     else:
-        _tell_league(found)
+        _print_league(found)
 
 
 def _moment(option: str, text: str | None) -> float | None:
@@ -178,14 +178,14 @@ def show(
     if as_json:
         echo_json(found, indent=1)
     elif entry is None:
-        _tell_league(found)
+        _print_league(found)
     else:
-        _tell_entry(found)
+        _print_entry(found)
     if found.get("problem"):
         raise typer.Exit(1)
 
 
-def _tell_league(league: Mapping[str, Any]) -> None:
+def _print_league(league: Mapping[str, Any]) -> None:
     rules = league["rules"]
     counts = {"total": "the time of all laps", "best": "the best lap", "average": "the mean of the complete laps"}
     echo(f"{league['name']}: {counted(rules['laps'], 'lap')} on {', '.join(league['track'])}; {_state(league)}")
@@ -202,7 +202,7 @@ def _tell_league(league: Mapping[str, Any]) -> None:
     echo(f"  digest:     {league['digest']}")
 
 
-def _tell_entry(entry: Mapping[str, Any]) -> None:
+def _print_entry(entry: Mapping[str, Any]) -> None:
     if "race" in entry:
         model, evaluation = entry["model"], entry["evaluation"]
         echo(f"entry {entry['entry']}: {entry['racer']} with {model['name']}@{model['version']} ({model['task']})")
@@ -254,7 +254,7 @@ def submit(
     path = f"/api/leagues/{named(league)}"
     if detach:
         with Client.connect() as client:
-            _tell_started(client.post(f"{path}/races", body, seconds=300, once=True), league, racer, as_json)
+            _print_started(client.post(f"{path}/races", body, seconds=300, once=True), league, racer, as_json)
         return
     with controller(store, cpus) as connect:
         client = connect()
@@ -277,7 +277,7 @@ def submit(
     echo(f"entry {row['entry']} of {league}: {row['racer']} with {row['model']}, {clock(row['time'])}, {place}")
 
 
-def _tell_started(started: Mapping[str, Any], league: str, racer: str | None, as_json: bool) -> None:
+def _print_started(started: Mapping[str, Any], league: str, racer: str | None, as_json: bool) -> None:
     if as_json:
         echo_json(started)
         return
@@ -358,7 +358,7 @@ def verify(
 ) -> None:
     """Check that entries and their models are unchanged; exit 1 if anything differs."""
     path = f"/api/leagues/{named(league)}"
-    told = []
+    answer = []
     with controller(store, cpus) as connect:
         client = connect()
         last = client.get(path)["entries"]
@@ -367,15 +367,15 @@ def verify(
             problems = [found["problem"]] if found.get("problem") else []
             if rerun and not problems:
                 problems = _again(client, f"{path}/entries/{number}/races", found)
-            told.append({"entry": number, "problems": problems})
+            answer.append({"entry": number, "problems": problems})
             good = "every lap is the same, bit for bit" if rerun else "the entry and its model are unchanged"
             for line in [] if as_json else problems or [good]:
                 echo(f"entry {number}: {line}")
     if as_json:
-        echo_json(told, indent=1)
-    elif not told:
+        echo_json(answer, indent=1)
+    elif not answer:
         echo(f"{league} is unchanged and has no entries")
-    if any(each["problems"] for each in told):
+    if any(each["problems"] for each in answer):
         raise typer.Exit(1)
 
 

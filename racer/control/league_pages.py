@@ -54,11 +54,11 @@ def leagues(request: Request) -> Response:
 @router.post("/leagues")
 def create(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Create a league; its rules are never changed."""
-    given: dict[str, Any] = {key: form.one(key) for key in form.fields if key in cases.CreateRequest.model_fields}
-    given = {key: value.strip() for key, value in given.items() if value.strip()}
-    given |= {key: _moment(key, given[key]) for key in ("opens", "closes") if key in given}
-    given["track"] = [each.strip() for each in form.every("track") if each.strip()]
-    body = body_of(cases.CreateRequest, {"name": "", **given})
+    fields: dict[str, Any] = {key: form.one(key) for key in form.fields if key in cases.CreateRequest.model_fields}
+    fields = {key: value.strip() for key, value in fields.items() if value.strip()}
+    fields |= {key: _moment(key, fields[key]) for key in ("opens", "closes") if key in fields}
+    fields["track"] = [each.strip() for each in form.every("track") if each.strip()]
+    body = body_of(cases.CreateRequest, {"name": "", **fields})
     league = cases.create_league(controller_of(request), actor_of(request), body)
     return done(request, f"/leagues/{league['name']}", f"created league {league['name']}")
 
@@ -103,8 +103,8 @@ def race(request: Request, name: str, form: Form = Depends(sent_form)) -> Respon
     """Submit the race of a model."""
     started = cases.race(controller_of(request), actor_of(request), name, body_of(cases.RaceRequest, _racer(form)))
     reference = f"{started['model']}@{started['version']}"
-    told = f"submitted the race of {reference} as {started['jobId'][:8]}; enter it here when it has ended"
-    return done(request, f"/leagues/{name}", told)
+    message = f"submitted the race of {reference} as {started['jobId'][:8]}; enter it here when it has ended"
+    return done(request, f"/leagues/{name}", message)
 
 
 @router.post("/leagues/{name}/entries")
@@ -171,8 +171,8 @@ def _racer(form: Form) -> dict[str, Any]:
 def _moment(key: str, text: str) -> float:
     """A time as Unix seconds, in UTC where it names no zone. Raises ClientError."""
     try:
-        given = datetime.fromisoformat(text)
-        return (given if given.tzinfo else given.replace(tzinfo=UTC)).timestamp()
+        when = datetime.fromisoformat(text)
+        return (when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()
     except (ValueError, OverflowError):
         raise ClientError(f"{key}: expected a time such as 2026-12-24T18:00") from None
 

@@ -21,8 +21,8 @@ def cells(row: Mapping[str, Any]) -> list[str]:
     """A row of the table as text, one cell for each of :data:`COLUMNS`."""
     laps = "-" if row["laps"] is None else f"{row['completed']} of {row['laps']}"
     counts = ["-" if row[key] is None else str(row[key]) for key in _NUMBERS]
-    told = {"ranked": "ranked", "altered": row["reason"]}
-    status = told.get(row["status"]) or f"{row['status']}: {row['reason']}"
+    words = {"ranked": "ranked", "altered": row["reason"]}
+    status = words.get(row["status"]) or f"{row['status']}: {row['reason']}"
     return [
         str(row["rank"] or "-"),
         str(row["entry"]),

@@ -1,4 +1,4 @@
-"""Use cases of leagues: create one, race a model in it, enter the race, read the table."""
+"""Leagues: create one, race a model in it, enter the race, read the table; each use case is a route of the native API, too."""
 
 from __future__ import annotations
 
@@ -6,12 +6,16 @@ import contextlib
 import os
 import re
 import time
+from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Annotated, Any
 
+from fastapi import APIRouter, Depends, Header, Query
 from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.api.http.callers import user_name
+from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
+from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.domain.job import Status
@@ -41,6 +45,10 @@ from shared_store.volume.models import Model
 LEAGUE_TAG, MODEL_TAG = "muster:league", "muster:model"
 """Tags of a race's job: the league, and the model as ``NAME@VERSION``."""
 _RACER = re.compile(r"\w[\w .'-]{0,63}")
+router = APIRouter(route_class=StoreRoute)
+_Controller = Annotated[Controller, Depends(controller_of)]
+_Actor = Annotated[Actor, Depends(actor_of)]
+_Key = Annotated[str | None, Header(alias=IDEMPOTENCY_HEADER)]
 _Seconds = Annotated[float, Field(ge=0, le=3600, allow_inf_nan=False)]
 _Moment = Annotated[float, Field(ge=0, lt=1e11, allow_inf_nan=False)]
 
@@ -96,16 +104,16 @@ class DisqualifyRequest(_Strict):
     reason: str = Field(min_length=1, max_length=500)
 
 
-def list_leagues(controller: Controller) -> list[dict[str, Any]]:
+@router.get("/leagues")
+def list_leagues(controller: _Controller) -> list[dict[str, Any]]:
     """All leagues by name, with their rules; an altered one has a ``problem``."""
     store = controller.access.store
-    try:
+    with _refusals():
         return [_described(stored_leagues.find(store, name)) for name in stored_leagues.names(store)]
-    except LeagueError as error:
-        raise _refused(error) from None
 
 
-def create_league(controller: Controller, actor: Actor, body: CreateRequest) -> dict[str, Any]:
+@router.post("/leagues")
+def create_league(controller: _Controller, actor: _Actor, body: CreateRequest) -> dict[str, Any]:
     """Create a league; its rules are never changed."""
     actor.check(operations.CREATE_LEAGUE)
     controller.writes.check(adds=True)
@@ -115,9 +123,9 @@ def create_league(controller: Controller, actor: Actor, body: CreateRequest) -> 
         raise ClientError(
             f"closes: {stored_leagues.moment(body.closes)} is past: no race could ever start; name a later time, or none"
         )
-    given = body.model_dump()
-    rules = Rules(**{key: given[key] for key in asdict(Rules())})
-    try:
+    fields = body.model_dump()
+    rules = Rules(**{key: fields[key] for key in asdict(Rules())})
+    with _refusals(f"league {body.name}", 400):
         digests = {name: stored_leagues.digest_of_track(controller.access.store, name) for name in body.track}
         league = League(
             name=body.name,
@@ -132,27 +140,26 @@ def create_league(controller: Controller, actor: Actor, body: CreateRequest) -> 
             track_digests={name: digest for name, digest in digests.items() if digest is not None},
         )
         return _described(stored_leagues.create(controller.access.store, league))
-    except LeagueError as error:
-        raise ClientError(str(error)) from None
-    except OSError as error:
-        raise ClientError(f"league {body.name} can't be written ({error.strerror or error})", 503) from None
 
 
-def read_league(controller: Controller, name: str) -> dict[str, Any]:
+@router.get("/leagues/{name}")
+def read_league(controller: _Controller, name: str) -> dict[str, Any]:
     """The rules of a league, and how many entries it has."""
     return _described(_find(controller, name)[0])
 
 
-def league_table(controller: Controller, name: str, *, every: bool = False) -> list[dict[str, Any]]:
+@router.get("/leagues/{name}/entries")
+def league_table(
+    controller: _Controller, name: str, every: Annotated[bool, Query(description="all entries of each racer")] = False
+) -> list[dict[str, Any]]:
     """The table, the first one ahead: of each racer the best entry, or ``every`` one, then those that are not ranked and why."""
     stored, league = _find(controller, name)
-    try:
+    with _refusals():
         return [row.document() for row in table(stored.contenders(), league.rules.ranking, every=every)]
-    except LeagueError as error:
-        raise _refused(error) from None
 
 
-def read_entry(controller: Controller, actor: Actor, name: str, number: int) -> Any:
+@router.get("/leagues/{name}/entries/{number}")
+def read_entry(controller: _Controller, actor: _Actor, name: str, number: int) -> Any:
     """An entry with its race and, where it is disqualified, the ruling; ``problem`` tells what was altered in it or in its model."""
     stored, _ = _find(controller, name)
     found: dict[str, Any] = {"entry": number}
@@ -162,7 +169,7 @@ def read_entry(controller: Controller, actor: Actor, name: str, number: int) -> 
         _verify(model)
         _check_digest(model, found)
     except UnknownLeague as error:
-        raise _refused(error) from None
+        raise ClientError(str(error), 404) from None
     except LeagueError as error:
         found["problem"] = stored.problem(number, error)
     except ClientError as error:  # of its model
@@ -170,47 +177,46 @@ def read_entry(controller: Controller, actor: Actor, name: str, number: int) -> 
     return actor.shown({**found, "ruling": stored.ruling(number)})
 
 
+@router.post("/leagues/{name}/races")
 def race(
-    controller: Controller,
-    actor: Actor,
+    controller: _Controller,
+    actor: _Actor,
     name: str,
     body: RaceRequest,
-    idempotency_key: str | None = None,
+    idempotency_key: _Key = None,
 ) -> dict[str, Any]:
     """Submit the evaluation of a model by the league's rules; a second call with the same idempotency key gets the answer of the first one."""
     stored, league = _find(controller, name)
     model = find_model(controller, actor, body.model, body.version)
     actor.check(operations.RACE, owner_of_model(model))
-    try:
+    with _refusals():
         if closed := league.closed(time.time()):
             raise LeagueError(closed)
         stored.admit(_caller(actor), _racer(actor, body))
-    except LeagueError as error:
-        raise _refused(error) from None
     return _submit(controller, actor, league, model, body.directory, idempotency_key)
 
 
+@router.post("/leagues/{name}/entries/{number}/races")
 def rerun(
-    controller: Controller,
-    actor: Actor,
+    controller: _Controller,
+    actor: _Actor,
     name: str,
     number: int,
     body: RerunRequest,
-    idempotency_key: str | None = None,
+    idempotency_key: _Key = None,
 ) -> dict[str, Any]:
     """Submit the race of an entry once more, whether the league is open or not; on a CPU its laps are the same."""
     stored, league = _find(controller, name)
-    try:
+    with _refusals():
         entry = stored.entry(number)
-    except LeagueError as error:
-        raise _refused(error) from None
     model = any_model(controller, entry["model"]["name"], entry["model"]["version"])
     actor.check(operations.RERUN_ENTRY, owner_of_model(model))
     _check_digest(model, entry)
     return _submit(controller, actor, league, model, body.directory, idempotency_key)
 
 
-def enter(controller: Controller, actor: Actor, name: str, body: EnterRequest) -> dict[str, Any]:
+@router.post("/leagues/{name}/entries")
+def enter(controller: _Controller, actor: _Actor, name: str, body: EnterRequest) -> dict[str, Any]:
     """Make an entry of a race that has ended: the model's digest, the evaluation and its laps, for good."""
     stored, league = _find(controller, name)
     model = find_model(controller, actor, body.model, body.version)
@@ -229,25 +235,20 @@ def enter(controller: Controller, actor: Actor, name: str, body: EnterRequest) -
             "versions": summary.get("versions"),
             "race": summary["race"],
         }
-        try:
+        with _refusals(f"league {name}: the entry"):
             return stored.enter(entry)
-        except LeagueError as error:
-            raise _refused(error) from None
-        except OSError as error:
-            raise ClientError(f"league {name}: the entry can't be written ({error.strerror or error})", 503) from None
 
 
-def disqualify(controller: Controller, actor: Actor, name: str, number: int, body: DisqualifyRequest) -> dict[str, Any]:
+@router.post("/leagues/{name}/entries/{number}/disqualify")
+def disqualify(
+    controller: _Controller, actor: _Actor, name: str, number: int, body: DisqualifyRequest
+) -> dict[str, Any]:
     """Disqualify an entry for good, with the reason; the entry itself stays as it is. For the league's owner."""
     stored, league = _find(controller, name)
     actor.check(operations.DISQUALIFY, Owned("league", league.name, league.owner))
     controller.writes.check(adds=True)
-    try:
+    with _refusals(f"league {name}: the ruling"):
         stored.disqualify(number, body.reason, _caller(actor))
-    except LeagueError as error:
-        raise _refused(error) from None
-    except OSError as error:
-        raise ClientError(f"league {name}: the ruling can't be written ({error.strerror or error})", 503) from None
     return {"entry": number, "ruling": stored.ruling(number)}
 
 
@@ -263,15 +264,20 @@ def entered_jobs(controller: Controller, name: str) -> set[str]:
 
 def _find(controller: Controller, name: str) -> tuple[StoredLeague, League]:
     """Raises ClientError where the league does not exist, or its rules were altered."""
-    try:
+    with _refusals():
         stored = stored_leagues.find(controller.access.store, name)
         return stored, stored.definition()
+
+
+@contextlib.contextmanager
+def _refusals(writing: str = "", status: int = CONFLICT) -> Iterator[None]:
+    """Raise ClientError for an error of a league, and where the file ``writing`` stands for can't be written."""
+    try:
+        yield
     except LeagueError as error:
-        raise _refused(error) from None
-
-
-def _refused(error: LeagueError) -> ClientError:
-    return ClientError(str(error), 404 if isinstance(error, UnknownLeague) else CONFLICT)
+        raise ClientError(str(error), 404 if isinstance(error, UnknownLeague) else status) from None
+    except OSError as error:
+        raise ClientError(f"{writing} can't be written ({error.strerror or error})", 503) from None
 
 
 def _described(stored: StoredLeague) -> dict[str, Any]:
@@ -284,7 +290,7 @@ def _described(stored: StoredLeague) -> dict[str, Any]:
 
 
 def _caller(actor: Actor) -> str:
-    """The owner of the caller's leagues and entries. A command with a controller of its own acts for this user, like one on loopback."""
+    """The owner of the caller's leagues and entries. A command that runs its controller acts for this user, like one on loopback."""
     return f"user {user_name(os.getuid())}" if actor == CONTROLLER else actor.name
 
 
@@ -327,10 +333,8 @@ def _checked(controller: Controller, league: League, model: Model) -> Checkpoint
     """The checkpoint that a sound model was made of, which a race loads. Raises ClientError."""
     _verify(model)
     facts = model.facts()
-    try:
+    with _refusals():
         league.check_tracks(controller.access.store)
-    except LeagueError as error:
-        raise _refused(error) from None
     kind = task_config(str(facts.get("task")))
     if kind is None or not issubclass(kind, RacerConfig):  # what a class of the user's own drives is unknown
         raise ClientError(

@@ -45,11 +45,11 @@ def _groups(task: str) -> list[FieldGroup]:
     reward = Field("train.config.reward_function", "code", value=EXAMPLE, file=CODE)
     names = [Field(f"train.hyperparameters.{each}") for each in kind.hyperparameters]
     theirs = "DeepRacer's names; they become settings of the algorithm, so give each in one place."
-    told = "Python, as DeepRacer has it: def reward_function(params). Empty: the rewards of the task."
+    reward_hint = "Python, as DeepRacer has it: def reward_function(params). Empty: the rewards of the task."
     return [
         FieldGroup("Tracks", (tracks,), True),
         FieldGroup("Action space", (Field("train.config.action_space", "code", value=space),), True, hint=hint),
-        FieldGroup("Reward function", (reward,), True, hint=told),
+        FieldGroup("Reward function", (reward,), True, hint=reward_hint),
         FieldGroup("Hyperparameters", tuple(names), hint=theirs),
     ]
 

@@ -16,7 +16,7 @@ from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.terminal import echo, echo_json, print_cut
 from orchestrator.domain.errors import ServerError, UsageError
-from racer.control.track_orders import ask
+from racer.control.track_orders import carry_out
 
 TrackArgument = Annotated[
     str, typer.Argument(metavar="NAME", help="A preset (oval), a seed (random:7), or a track of the store.")
@@ -47,7 +47,7 @@ def register(app: typer.Typer) -> None:
 
 def list_tracks(store: StoreOption = None, as_json: JsonOption = False) -> None:
     """List the presets and the tracks of the store, with their measures."""
-    found = _ask({"action": "list"}, store)
+    found = _request({"action": "list"}, store)
     if as_json:
         echo_json(found, indent=1)
         return
@@ -71,7 +71,7 @@ def show(
     as_json: JsonOption = False,
 ) -> None:
     """Show a track's measures; with -o draw it as a picture, or write it as a file for other tools."""
-    _tell(_ask({"action": "show", "name": track}, store, output, overwrite), output, as_json)
+    _print(_request({"action": "show", "name": track}, store, output, overwrite), output, as_json)
 
 
 def make(
@@ -103,16 +103,16 @@ def make(
     """Make a track from a preset or a seed, and store it."""
     if (preset is None) == (seed is None):
         raise UsageError("give one of --preset (oval, rounded-rectangle, chicane) and --seed N")
-    given = {"length": length, "width": width, "spacing": spacing, "direction": direction}
+    named = {"length": length, "width": width, "spacing": spacing, "direction": direction}
     drawn = {"roughness": roughness, "least_radius": least_radius}
     for option, value in drawn.items():
         if preset is not None and value is not None:
             raise UsageError(
                 f"--{option.replace('_', '-')} belongs to --seed; a preset's curves follow from its length"
             )
-    measures = {key: value for key, value in {**given, **drawn}.items() if value is not None}
+    measures = {key: value for key, value in {**named, **drawn}.items() if value is not None}
     order = {"action": "make", "name": name, "preset": preset, "seed": seed, "measures": measures}
-    _tell(_ask(order, store, output, overwrite), output, as_json)
+    _print(_request(order, store, output, overwrite), output, as_json)
 
 
 def import_file(
@@ -130,10 +130,10 @@ def import_file(
 ) -> None:
     """Check a track in DeepRacer's community format, and store it."""
     order = {"action": "import", "file": str(file.absolute()), "name": name}
-    _tell(_ask(order, store, output, overwrite), output, as_json)
+    _print(_request(order, store, output, overwrite), output, as_json)
 
 
-def _ask(order: Mapping[str, Any], store: str | None, output: Path | None = None, overwrite: bool = False) -> Any:
+def _request(order: Mapping[str, Any], store: str | None, output: Path | None = None, overwrite: bool = False) -> Any:
     """Have another process do it, in the controller's store. Raises UsageError, ServerError."""
     if output is not None:
         check_output(output, overwrite, ".png", ".npy")
@@ -141,10 +141,10 @@ def _ask(order: Mapping[str, Any], store: str | None, output: Path | None = None
         place = connect().get("/api/capacity")["store"]
     if not Path(place).is_dir():
         raise ServerError(f"the controller's store, {place}, is not on this machine; run the command where it is")
-    return ask({**order, "store": place, "output": str(output.absolute()) if output else None})
+    return carry_out({**order, "store": place, "output": str(output.absolute()) if output else None})
 
 
-def _tell(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None:
+def _print(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None:
     if as_json:
         echo_json(track, indent=1)
         return

@@ -15,7 +15,7 @@ _PATIENCE = 120.0
 """Seconds that an order may take."""
 
 
-def ask(order: Mapping[str, Any]) -> Any:
+def carry_out(order: Mapping[str, Any]) -> Any:
     """Give an order to :mod:`racer.tracks`, and return its answer.
 
     Args:
@@ -29,12 +29,12 @@ def ask(order: Mapping[str, Any]) -> Any:
         raise ServerError("tracks need numpy, which this environment lacks: pip install 'muster[worker]'")
     command = [sys.executable, "-P", "-m", "racer.tracks", json.dumps(order)]
     try:
-        asked = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_PATIENCE)
+        process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_PATIENCE)
     except subprocess.TimeoutExpired:
         raise ServerError(f"racer.tracks has not answered within {_PATIENCE:.0f} s; does the store answer?") from None
-    said = asked.stderr.strip().splitlines() or [f"it ended with exit code {asked.returncode}"]
-    if asked.returncode == 2:
-        raise UsageError(said[-1])
-    if asked.returncode:
-        raise ServerError(f"racer.tracks: {said[-1]}")
-    return json.loads(asked.stdout)
+    lines = process.stderr.strip().splitlines() or [f"it ended with exit code {process.returncode}"]
+    if process.returncode == 2:
+        raise UsageError(lines[-1])
+    if process.returncode:
+        raise ServerError(f"racer.tracks: {lines[-1]}")
+    return json.loads(process.stdout)

@@ -46,10 +46,10 @@ def tracks(request: Request, name: str = Query(default="", max_length=130)) -> R
 @router.post("/tracks")
 def make(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Make a track, for good: of the preset that was chosen, else of the seed."""
-    given = {key: value for key in MakeRequest.model_fields if (value := form.one(key).strip())}
-    if "preset" in given:
-        given.pop("seed", None)
-    track = make_track(request, body_of(MakeRequest, {"name": "", **given}))
+    fields = {key: value for key in MakeRequest.model_fields if (value := form.one(key).strip())}
+    if "preset" in fields:
+        fields.pop("seed", None)
+    track = make_track(request, body_of(MakeRequest, {"name": "", **fields}))
     return done(request, f"/tracks/{quote(track['name'], safe='')}", f"made track {track['name']}")
 
 
@@ -133,7 +133,7 @@ def facts(track: Mapping[str, Any]) -> dict[str, Any]:
         return {**shown, "facts": []}
     least, most = track["width"]
     origin = track.get("origin") or {}
-    told = {
+    details = {
         "Length": f"{track['length']:.2f} m",
         "Width": f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m",
         "Tightest radius": f"{track['least_radius']:.2f} m",
@@ -143,7 +143,7 @@ def facts(track: Mapping[str, Any]) -> dict[str, Any]:
         "Mended": "; ".join(map(str, origin.get("notes") or ())),
         "Digest": track["digest"],
     }
-    return {**shown, "about": track.get("about", ""), "facts": list(told.items())}
+    return {**shown, "about": track.get("about", ""), "facts": list(details.items())}
 
 
 def drawn(rings: Mapping[str, Sequence[Sequence[float]]], closed: bool = True) -> str:

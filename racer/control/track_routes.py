@@ -17,7 +17,7 @@ from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError, ServerError, UsageError
 from orchestrator.services.permissions import Shared
 from racer.control.operations import LIST_TRACKS, MAKE_TRACK
-from racer.control.track_orders import ask
+from racer.control.track_orders import carry_out
 
 router = APIRouter(route_class=StoreRoute)
 _turns = Turns("other tracks are being drawn")
@@ -50,9 +50,9 @@ def list_tracks(
     controller, actor = controller_of(request), actor_of(request)
     actor.check(LIST_TRACKS)
     if name is None:
-        found: list[dict[str, Any]] = _ask(controller, {"action": "list", "rings": rings})
+        found: list[dict[str, Any]] = _request(controller, {"action": "list", "rings": rings})
         return found
-    return [_ask(controller, {"action": "show", "name": name, "rings": rings})]
+    return [_request(controller, {"action": "show", "name": name, "rings": rings})]
 
 
 @router.post("/tracks")
@@ -68,7 +68,7 @@ def make_track(request: Request, body: MakeRequest) -> dict[str, Any]:
         if body.preset is not None and key in measures:
             raise ClientError(f"{key} belongs to seed; a preset's curves follow from its length")
     order = {"action": "make", "name": body.name, "preset": body.preset, "seed": body.seed, "measures": measures}
-    made: dict[str, Any] = _ask(controller, order, 400)
+    made: dict[str, Any] = _request(controller, order, 400)
     return made
 
 
@@ -76,15 +76,15 @@ def picture(controller: Controller, name: str) -> bytes:
     """The PNG of a track. Raises ClientError."""
     with TemporaryDirectory() as folder:
         path = Path(folder) / "track.png"
-        _ask(controller, {"action": "show", "name": name, "output": str(path)})
+        _request(controller, {"action": "show", "name": name, "output": str(path)})
         return path.read_bytes()
 
 
-def _ask(controller: Controller, order: Mapping[str, Any], status: int = 404) -> Any:
+def _request(controller: Controller, order: Mapping[str, Any], status: int = 404) -> Any:
     """``status``: of the answer where the order can't be carried out. Raises ClientError."""
     try:
         with _turns.turn():
-            return ask({**order, "store": str(controller.access.store.path)})
+            return carry_out({**order, "store": str(controller.access.store.path)})
     except UsageError as error:
         raise ClientError(str(error), status) from None
     except ServerError as error:

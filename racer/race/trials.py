@@ -1,4 +1,4 @@
-"""A race: what is noted of each control step of its trials, their times and penalties, and their SimTrace files."""
+"""Race recording: each trial's control steps, times, penalties and SimTrace files."""
 
 from __future__ import annotations
 

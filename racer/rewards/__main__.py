@@ -33,20 +33,22 @@ def main() -> int:
         help='track and obstacles of the task, such as {"track": "chicane"}: the samples are of them; by default of an oval',
     )
     parser.add_argument("--store", type=Path, metavar="DIRECTORY", help="of the tracks that are not made from a name")
-    failed, asked = 0, parser.parse_args()
+    failed, arguments = 0, parser.parse_args()
     courses: tuple[Course, ...] = (FINE_OVAL,)
     unknown: list[str] = []
-    if asked.config is not None:
+    if arguments.config is not None:
         from racer.car.courses import courses_for  # it takes numpy
 
         try:
-            config = json.loads(asked.config)
+            config = json.loads(arguments.config)
         except (ValueError, RecursionError):
             config = None
         if not isinstance(config, dict):
-            sys.exit(f'--config: expected a JSON object such as {{"track": "chicane"}}, found {shown(asked.config)}')
-        courses, unknown = courses_for(config, Store(asked.store) if asked.store else None)
-    for path in asked.files:
+            sys.exit(
+                f'--config: expected a JSON object such as {{"track": "chicane"}}, found {shown(arguments.config)}'
+            )
+        courses, unknown = courses_for(config, Store(arguments.store) if arguments.store else None)
+    for path in arguments.files:
         for line in unknown:
             print(f"{path}: {line}", file=sys.stderr)
         problem = check(path, courses, note=lambda line: print(line, file=sys.stderr))

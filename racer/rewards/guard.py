@@ -280,7 +280,7 @@ def try_out(
     anyway: bool = False,
     note: Note | None = None,
 ) -> Problem | None:
-    """Faults with sample inputs, found in a process of its own with limits. Other arguments as of :func:`check_source`.
+    """Faults with sample inputs, found in a separate process with limits. Other arguments as of :func:`check_source`.
 
     Args:
         source: The text.
@@ -292,7 +292,7 @@ def try_out(
     The process may be in the hands of an attacker: its answer is bounded, and can say nothing but a fault of this function.
     """
     root = str(Path(__file__).parents[3])
-    asked = {
+    request = {
         "source": source,
         "file": file,
         "samples": samples,
@@ -300,7 +300,7 @@ def try_out(
         "root": root,
         "anyway": anyway,
     }
-    answer, errors, code = _answer(json.dumps(asked).encode())
+    answer, errors, code = _answer(json.dumps(request).encode())
     lines = [line for each in answer.decode(errors="replace").splitlines() if (line := _read_line(each))]
     unconfined = next((plain(str(line["unconfined"])) for line in lines[:1] if "unconfined" in line), "")
     if unconfined and note is not None:
@@ -324,7 +324,7 @@ def try_out(
     return Problem("TEST_FAILURE", f"{_last(lines)} ended the process ({cause})", file)
 
 
-def _answer(asked: bytes) -> tuple[bytes, bytes, int | None]:
+def _answer(request: bytes) -> tuple[bytes, bytes, int | None]:
     """What the process wrote, its errors, and its exit code; None: it did not end in time."""
     late = threading.Event()
 
@@ -344,7 +344,7 @@ def _answer(asked: bytes) -> tuple[bytes, bytes, int | None]:
         timer.start()
         try:
             with contextlib.suppress(BrokenPipeError), process.stdin:
-                process.stdin.write(asked)
+                process.stdin.write(request)
             answer = process.stdout.read(_MOST_OUTPUT)
             if len(answer) == _MOST_OUTPUT:
                 process.kill()

@@ -25,8 +25,8 @@ _MOST_FAILURES = 20
 
 def main() -> None:
     """Serve steps until standard input ends."""
-    asked = json.loads(sys.stdin.buffer.readline())
-    sys.path.append(asked["root"])
+    request = json.loads(sys.stdin.buffer.readline())
+    sys.path.append(request["root"])
     from racer.rewards import confinement as confined
     from racer.rewards import namespaces, parameters, problems
 
@@ -35,9 +35,9 @@ def main() -> None:
     nothing = os.open(os.devnull, os.O_RDWR)
     for descriptor in (0, 1, 2):
         os.dup2(nothing, descriptor)
-    file, seconds, worlds = asked["file"], asked["seconds"], asked["worlds"]
-    tracks = [[tuple(point) for point in track] for track in asked["tracks"]]
-    shared = memoryview(mmap.mmap(asked["shared"], 0)).cast("f")  # its descriptor is closed, and its size sealed
+    file, seconds, worlds = request["file"], request["seconds"], request["worlds"]
+    tracks = [[tuple(point) for point in track] for track in request["tracks"]]
+    shared = memoryview(mmap.mmap(request["shared"], 0)).cast("f")  # its descriptor is closed, and its size sealed
     width, most, of_object = parameters.NUMBERS, parameters.MOST_OBJECTS, parameters.OBJECT_NUMBERS
     numbers, objects = shared[: worlds * width], shared[worlds * width : worlds * (width + most * of_object)]
     rewards = shared[worlds * (width + most * of_object) :]
@@ -67,7 +67,7 @@ def main() -> None:
         gc.collect()
         gc.disable()
         try:
-            program = namespaces.RewardProgram(asked["source"], file)
+            program = namespaces.RewardProgram(request["source"], file)
             for _ in cars:
                 printed.count = 0
                 alarm.set(_LOADING)
@@ -88,13 +88,13 @@ def main() -> None:
 
     alarm, printed = confined.CallTimeout(expired), confined.Printed(flooded)
     # where it does not hold, the guard has refused it
-    confined.confine(asked["memory"], keep=(steps.fileno(), out.fileno()))
-    cars = range(asked["first"], asked["last"])
+    confined.confine(request["memory"], keep=(steps.fileno(), out.fileno()))
+    cars = range(request["first"], request["last"])
     with confined.printing(printed):
         functions = load()
         answer([])
-        while request := steps.readline():
-            if request == ANEW:
+        while order := steps.readline():
+            if order == ANEW:
                 functions.clear()
                 functions = load()
                 answer([])

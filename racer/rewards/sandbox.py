@@ -57,7 +57,7 @@ _CALLS: dict[str, tuple[int | None, int | None]] = {
     "sched_yield": (24, 124),
     "sched_getaffinity": (204, 123),
     "getcpu": (309, 168),
-    # clocks, signals of its own, who and where it is
+    # clocks, the process's signals, identity and host
     "clock_gettime": (228, 113),
     "clock_getres": (229, 114),
     "clock_nanosleep": (230, 115),

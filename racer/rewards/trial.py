@@ -16,8 +16,8 @@ from typing import Any, NoReturn
 
 def main() -> None:
     """Try the function; each line of standard output says which sample is next, or what is wrong."""
-    asked = json.load(sys.stdin)
-    sys.path.append(asked["root"])
+    request = json.load(sys.stdin)
+    sys.path.append(request["root"])
     from racer.rewards import confinement as confined
     from racer.rewards import namespaces
 
@@ -26,15 +26,15 @@ def main() -> None:
     nothing = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nothing, 1)
     os.dup2(nothing, 2)
-    file = asked["file"]
-    now, limit = "the module", 4 * asked["seconds"]  # it imports packages, on a loaded machine
+    file = request["file"]
+    now, limit = "the module", 4 * request["seconds"]  # it imports packages, on a loaded machine
 
-    def tell(**what: Any) -> None:
+    def report(**what: Any) -> None:
         out.write(json.dumps(what) + "\n")
         out.flush()
 
     def end(kind: str, message: str, line: int) -> NoReturn:
-        tell(kind=kind, message=message, line=line)
+        report(kind=kind, message=message, line=line)
         os._exit(0)
 
     def expired(frame: Any) -> None:
@@ -46,19 +46,19 @@ def main() -> None:
         end("TEST_FAILURE", f"{now} printed more than {confined.MOST_PRINTED >> 10} KiB of text", line)
 
     alarm, printed = confined.CallTimeout(expired), confined.Printed(flooded)
-    if unconfined := confined.confine(cpu=int(4 * asked["seconds"]) + 5, keep=(out.fileno(),)):
-        tell(unconfined=unconfined)
-        if not asked["anyway"]:
+    if unconfined := confined.confine(cpu=int(4 * request["seconds"]) + 5, keep=(out.fileno(),)):
+        report(unconfined=unconfined)
+        if not request["anyway"]:
             os._exit(0)
     try:
         with confined.printing(printed):
-            tell(trying=now)
+            report(trying=now)
             alarm.set(limit)
-            car = namespaces.RewardProgram(asked["source"], file).car()
-            limit = asked["seconds"]
-            for name, params in asked["samples"].items():
+            car = namespaces.RewardProgram(request["source"], file).car()
+            limit = request["seconds"]
+            for name, params in request["samples"].items():
                 now = f"the sample {name!r}"
-                tell(trying=now)
+                report(trying=now)
                 _points(params)
                 printed.count = 0
                 alarm.set(limit)
@@ -72,7 +72,7 @@ def main() -> None:
         if isinstance(error, namespaces.Forbidden):
             kind = "FORBIDDEN"
         end(kind, f"{now}: {confined.error_message(error)}", confined.line_of(error, file))
-    tell(kind="", message="", line=0)
+    report(kind="", message="", line=0)
 
 
 def _points(params: dict[str, Any]) -> None:

@@ -105,7 +105,7 @@ class Workers:
         self.failures: dict[str, Failure] = {}
         self._first: dict[str, str] = {}
         self._called = False
-        asked = {
+        request = {
             "source": source,
             "file": file,
             "seconds": seconds,
@@ -119,7 +119,7 @@ class Workers:
         self.processes: list[subprocess.Popen[bytes]] = []
         try:
             for first in firsts:
-                self._start({**asked, "first": first, "last": min(first + self._share, worlds)})
+                self._start({**request, "first": first, "last": min(first + self._share, worlds)})
             self._answers(_START + _COPY * self._share)
         except BaseException:
             self.close()
@@ -134,9 +134,9 @@ class Workers:
         self.failures.clear()
         if self._called:
             self._called = False
-            self._ask(ANEW, _START + _COPY * self._share)
+            self._request(ANEW, _START + _COPY * self._share)
 
-    def _start(self, asked: Mapping[str, Any]) -> None:
+    def _start(self, request: Mapping[str, Any]) -> None:
         process = subprocess.Popen(
             [sys.executable, "-I", "-B", str(Path(__file__).with_name("interpreter.py"))],
             stdin=subprocess.PIPE,
@@ -146,7 +146,7 @@ class Workers:
         )
         self.processes.append(process)
         assert process.stdin is not None
-        process.stdin.write(json.dumps(asked).encode() + b"\n")
+        process.stdin.write(json.dumps(request).encode() + b"\n")
         process.stdin.flush()
 
     def rewards(self) -> np.ndarray:
@@ -158,10 +158,10 @@ class Workers:
             RewardFailed: A call does not return, floods its output or ends its process. The pool is closed.
         """
         self._called = True
-        self._ask(b"\n", self._seconds * (self._share + 1) + 5.0)
+        self._request(b"\n", self._seconds * (self._share + 1) + 5.0)
         return self._rewards.copy()
 
-    def _ask(self, line: bytes, patience: float) -> None:
+    def _request(self, line: bytes, patience: float) -> None:
         if not self.processes:
             raise RewardFailed(f"{self.file}: the processes that call the reward function have ended")
         try:

@@ -152,8 +152,8 @@ def _sensors(sensors: Any) -> tuple[str | None, list[str]]:
         raise Refused(("sensor",), f"expected a list such as [{CAMERA}], found {shown(sensors)}")
     for number, sensor in enumerate(sensors):
         if not isinstance(sensor, str) or sensor not in (*CAMERAS, *LIDARS):
-            there = ", ".join((CAMERA, *LIDARS))
-            raise Refused(("sensor", number), f"DeepRacer knows no sensor {shown(sensor)}; use {there}")
+            names = ", ".join((CAMERA, *LIDARS))
+            raise Refused(("sensor", number), f"DeepRacer knows no sensor {shown(sensor)}; use {names}")
     for kind, known in (("camera", CAMERAS), ("lidar", LIDARS)):
         several = [sensor for sensor in sensors if sensor in known]
         if len(several) > 1:
@@ -171,17 +171,17 @@ def _discrete(space: Any) -> ActionSpace:
     if not is_list or not CHOICES[0] <= len(space) <= CHOICES[1]:
         found = f"found {len(space)}, which AWS refuses, too" if is_list else f"found {shown(space)}"
         raise Refused(("action_space",), f"expected a list of {CHOICES[0]} to {CHOICES[1]} actions, {found}")
-    asked = []
+    requested = []
     for number, action in enumerate(space):
         where = ("action_space", number)
         _check_keys(where, action, ("steering_angle", "speed"))
-        asked.append(
+        requested.append(
             (
                 _number((*where, "steering_angle"), action["steering_angle"], "degrees"),
                 _number((*where, "speed"), action["speed"], "m/s"),
             )
         )
-    steerings, speeds = zip(*asked, strict=True)
+    steerings, speeds = zip(*requested, strict=True)
     clipped = (
         ([abs(angle) > STEERING[1] for angle in steerings], "a steering angle beyond", STEERING[1], "degrees", "steer"),
         ([speed > SPEED[1] for speed in speeds], "a speed above", SPEED[1], "m/s", "drive"),
@@ -194,7 +194,7 @@ def _discrete(space: Any) -> ActionSpace:
         for which, what, limit, unit, does in clipped
         if any(which)
     )
-    choices = tuple((_clipped(angle, STEERING), _clipped(speed, SPEED)) for angle, speed in asked)
+    choices = tuple((_clipped(angle, STEERING), _clipped(speed, SPEED)) for angle, speed in requested)
     steerings, speeds = zip(*choices, strict=True)
     return ActionSpace((min(steerings), max(steerings)), (min(speeds), max(speeds)), choices, notes=notes)
 
@@ -210,14 +210,14 @@ def _range(name: str, ends: Any, limits: tuple[float, float], unit: str, notes: 
     """The ends within the limits, with a note for one that is clipped."""
     where = ("action_space", name)
     _check_keys(where, ends, ("low", "high"))
-    asked = [_number((*where, end), ends[end], unit) for end in ("low", "high")]
-    low, high = (_clipped(each, limits) for each in asked)
+    requested = [_number((*where, end), ends[end], unit) for end in ("low", "high")]
+    low, high = (_clipped(each, limits) for each in requested)
     if low >= high:
-        wrong = f"low is {asked[0]:g} and high is {asked[1]:g}"
-        if asked[0] < asked[1]:
+        wrong = f"low is {requested[0]:g} and high is {requested[1]:g}"
+        if requested[0] < requested[1]:
             raise Refused(where, f"{wrong}; the car's range is {limits[0]:g} to {limits[1]:g} {unit}")
         raise Refused(where, f"{wrong}; low must be less")
-    for end, each, becomes in zip(("low", "high"), asked, (low, high), strict=True):
+    for end, each, becomes in zip(("low", "high"), requested, (low, high), strict=True):
         if becomes != each:
             notes.append(f"{name}.{end} is {each:g} {unit}, out of the car's range, and becomes {becomes:g}")
     return low, high

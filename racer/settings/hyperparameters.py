@@ -69,13 +69,13 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
     Raises:
         Refused: One of them is misspelt, out of range, or given as a setting, too.
     """
-    where, given = "hyperparameters", train["hyperparameters"]
-    if not isinstance(given, Mapping):
-        raise Refused((where,), f"expected a mapping such as {{lr: 3.0e-4}}, or a JSON file, found {shown(given)}")
+    where, values = "hyperparameters", train["hyperparameters"]
+    if not isinstance(values, Mapping):
+        raise Refused((where,), f"expected a mapping such as {{lr: 3.0e-4}}, or a JSON file, found {shown(values)}")
     algorithm = train.get("algorithm", "ppo")
     if algorithm not in ("ppo", "sac"):
         raise Refused((where,), f"they are settings of ppo and sac, and the algorithm is {shown(algorithm)}")
-    checked = {name: _checked(where, str(name), value) for name, value in given.items()}
+    checked = {name: _checked(where, str(name), value) for name, value in values.items()}
     worlds = train.get("worlds")
     own = _at(train, ("ppo", "steps"))
     job = TrainingFacts(
@@ -86,7 +86,7 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
     )
     plain = {key: dict(value) if isinstance(value, Mapping) else value for key, value in train.items() if key != where}
     notes = []
-    # how long an iteration is comes before what it is divided into
+    # the length of an iteration is set before its division into minibatches
     for name in sorted(checked, key=lambda name: name != "num_episodes_between_training"):
         try:
             settings, note = _meaning(name, checked[name], job)
@@ -100,7 +100,7 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
             if setting == ("ppo", "steps"):
                 job = TrainingFacts(job.algorithm, job.worlds, value, job.has_camera)
         if note:
-            notes.append(f"{where}.{name} {given[name]}: {note}")
+            notes.append(f"{where}.{name} {values[name]}: {note}")
     return plain, notes
 
 

@@ -119,7 +119,7 @@ class League:
         """The first mismatch of an evaluation's summary with this league's rules, tracks, seed and car; empty without any."""
         race = summary.get("race")
         if not isinstance(race, Mapping):
-            return "it is no race"
+            return "it is not a race"
         driven, ruled = race.get("rules"), rules_of(self.section())
         for key in sorted(ruled.keys() - {"ranking"}):  # which follows from the times
             value = driven.get(key) if isinstance(driven, Mapping) else None
@@ -177,10 +177,10 @@ class StoredLeague:
         """Numbers of all entries. Raises LeagueError."""
         try:
             refuse_links(self.path / "entries", 3)
-            there = [int(name) for name in os.listdir(self.path / "entries") if _NUMBER.fullmatch(name)]
+            present = [int(name) for name in os.listdir(self.path / "entries") if _NUMBER.fullmatch(name)]
         except (DamagedFile, OSError) as error:
             raise LeagueError(f"league {self.name}: entries can't be read ({error})") from None
-        return range(1, max(there, default=0) + 1)
+        return range(1, max(present, default=0) + 1)
 
     def entry(self, number: int) -> dict[str, Any]:
         """The sealed content of an entry, with its ``digest``. Raises UnknownLeague; LeagueError if it is altered."""
@@ -288,10 +288,10 @@ class StoredLeague:
             raise LeagueError(f"league {self.name}: {owner} has made {made}, as many as one may make")
 
     def _check_number(self, number: int) -> None:
-        there = self.numbers()
-        if number not in there:
-            told = f"there are 1 to {len(there)}" if there else "there is none yet"
-            raise UnknownLeague(f"league {self.name}: entry {number} does not exist; {told}")
+        present = self.numbers()
+        if number not in present:
+            range_text = f"there are 1 to {len(present)}" if present else "there is none yet"
+            raise UnknownLeague(f"league {self.name}: entry {number} does not exist; {range_text}")
 
     def _sealed(self, folder: Path, name: str, what: str) -> tuple[dict[str, Any], str]:
         """The document in a sealed directory and the digest of its manifest. Raises LeagueError."""

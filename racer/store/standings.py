@@ -65,7 +65,7 @@ class RaceResults:
 def read_race(race: Any) -> RaceResults:
     """The counted results in the key ``race`` of an evaluation's summary. Raises BadRace."""
     if not isinstance(race, Mapping):
-        raise BadRace("it is no race: its summary has no key race")
+        raise BadRace("it is not a race: its summary has no key race")
     rules, trials = race.get("rules"), race.get("trials")
     laps = rules.get("laps") if isinstance(rules, Mapping) else None
     if not isinstance(laps, int) or not isinstance(trials, list) or len(trials) != laps:

@@ -57,7 +57,7 @@ def check(center: Floats, inner: Floats, outer: Floats, closed: bool = True) -> 
     _check_steps(center, closed)
     _check_curves(center, closed)
     if crossing := first_crossing(rings, closed):
-        raise BadTrack(_crossing_told(rings, *crossing))
+        raise BadTrack(_describe_crossing(rings, *crossing))
     if closed:
         if not inside(center, inner[:1])[0]:
             turned = " (the borders seem to be swapped)" if inside(center, outer[:1])[0] else ""
@@ -137,9 +137,9 @@ def inside(ring: Floats, points: Floats) -> NDArray[np.bool_]:
 
 def left_of_line(center: Floats, border: Floats) -> NDArray[np.bool_]:
     """Whether the points of a border (N, 2) that are nearest to each waypoint of an open line lie to the left of it, (N,)."""
-    away = nearest_points(border, center, closed=False) - center
+    offset = nearest_points(border, center, closed=False) - center
     ahead = np.diff(center, axis=0)
-    left: NDArray[np.bool_] = cross(np.concatenate((ahead, ahead[-1:])), away) > 0
+    left: NDArray[np.bool_] = cross(np.concatenate((ahead, ahead[-1:])), offset) > 0
     return left
 
 
@@ -182,7 +182,7 @@ def _straddles(start: Floats, end: Floats, first: Floats, second: Floats) -> NDA
     return found
 
 
-def _crossing_told(rings: tuple[Floats, ...], ring: int, row: int, other: int, other_row: int) -> str:
+def _describe_crossing(rings: tuple[Floats, ...], ring: int, row: int, other: int, other_row: int) -> str:
     where = f"{at(rings[ring], row)}"
     if ring == other:
         return f"the {RINGS[ring]} crosses or touches itself: {where} and {at(rings[other], other_row)}"

@@ -42,7 +42,7 @@ class Circuit:
         return ", ".join(track.name for track in self.tracks) + (f", {counted(boxes, 'obstacle')}" if boxes else "")
 
 
-def circuit_of(tracks: Sequence[Track], wanted: Sequence[ObstacleConfig]) -> Circuit:
+def circuit_of(tracks: Sequence[Track], obstacles: Sequence[ObstacleConfig]) -> Circuit:
     """Tracks with the boxes that a configuration asks for, on each of them.
 
     A lane is the middle of the road's half at the inner or the outer border, or the centre line.
@@ -50,16 +50,16 @@ def circuit_of(tracks: Sequence[Track], wanted: Sequence[ObstacleConfig]) -> Cir
     Raises:
         Refused: A box is beyond the end of a track.
     """
-    poses = np.zeros((len(tracks), len(wanted), 3))
+    poses = np.zeros((len(tracks), len(obstacles), 3))
     for track_poses, track in zip(poses, tracks, strict=True):
-        for number, obstacle in enumerate(wanted):
+        for number, obstacle in enumerate(obstacles):
             if obstacle.distance >= track.length:
                 raise Refused(
                     ("obstacles", number, "distance"),
                     f"{obstacle.distance:g} m is beyond the end of track {track.name}, which is {track.length:.2f} m long",
                 )
             track_poses[number] = _pose(track, obstacle)
-    along = np.array([[obstacle.distance for obstacle in wanted]] * len(tracks)).reshape(len(tracks), len(wanted))
+    along = np.array([[obstacle.distance for obstacle in obstacles]] * len(tracks)).reshape(len(tracks), len(obstacles))
     return Circuit(tracks, side_by_side(tracks), poses, along)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from racer.tracks.arithmetic import Floats, left_of, norm, sine_cosine
 from racer.tracks.checks import BadTrack, radii_of
-from racer.tracks.presets import SPACING, WIDTH, check_room, check_wanted, waypoints
+from racer.tracks.presets import SPACING, WIDTH, check_measures, check_room, waypoints
 from racer.tracks.race_track import CLOCKWISE, COUNTER_CLOCKWISE, Direction, Track
 
 LENGTH = 30.0
@@ -57,7 +57,7 @@ def make_random(
     Raises:
         BadTrack: A measure is out of range, or no curve fits in 200 tries.
     """
-    check_wanted(length, width, spacing, direction)
+    check_measures(length, width, spacing, direction)
     if not 0 <= seed <= LARGEST_SEED:
         raise BadTrack(f"seed {seed}: expected a whole number from 0 to {LARGEST_SEED}")
     if not 0 <= roughness <= 1:

@@ -109,7 +109,7 @@ def make_preset(
         raise BadTrack(f"preset {preset}: there is no such preset; {nearest(preset, PRESETS)}")
     found = PRESETS[preset]
     length = found.length if length is None else length
-    check_wanted(length, width, spacing, direction)
+    check_measures(length, width, spacing, direction)
     parts = found.half * 2
     unit = length / math.fsum(part.length for part in parts)
     radius = unit * min(part.length / abs(part.turn) for part in parts if part.turn)
@@ -121,7 +121,7 @@ def make_preset(
     return track.turned_round() if direction == CLOCKWISE else track
 
 
-def check_wanted(length: float, width: float, spacing: float, direction: str) -> None:
+def check_measures(length: float, width: float, spacing: float, direction: str) -> None:
     """Raise BadTrack for measures that no track is made with."""
     limits = {"length": (length, LENGTHS), "width": (width, WIDTHS), "spacing": (spacing, SPACINGS)}
     for what, (value, (least, most)) in limits.items():

@@ -135,8 +135,8 @@ def nearest(road: RoadArrays, track: int, point: wp.vec2, begin: int, many: int)
         segment = road.center[first + next_row(road, track, row)] - start
         step = road.steps[first + row]
         share = wp.clamp(wp.dot(point - start, segment) / (step * step), 0.0, 1.0)
-        away = point - start - share * segment
-        squared = wp.dot(away, away)
+        offset = point - start - share * segment
+        squared = wp.dot(offset, offset)
         if squared < best:
             best = squared
             best_row = row

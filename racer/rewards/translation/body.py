@@ -1,164 +1,125 @@
-"""The body of one function in C++: what its variables are follows from all that is assigned to them."""
+"""The body of a function in C++, whose variables' shapes follow from all that is assigned to them, and of the module around it."""
 
 from __future__ import annotations
 
 import ast
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from racer.rewards.translation.calls import Calls
-from racer.rewards.translation.expression_values import (
+from racer.rewards.translation.calls import BUILTINS, Calls
+from racer.rewards.translation.prelude import CONSTANTS, NO_RESULT
+from racer.rewards.translation.values import (
     C_TYPES,
-    Constant,
-    ItemList,
+    Function,
+    Known,
+    Number,
     Outside,
-    Thing,
+    Series,
     Value,
-    codes,
-    described,
     flat,
-    joined,
-    parenthesised,
+    is_known,
+    kept,
     rebuilt,
     shape_of,
 )
-from racer.rewards.translation.prelude import NO_RESULT
-from racer.rewards.translation.program import Program
 
 _MOST_PASSES = 16
+_MOST_NAMES = 50_000
 _DEEPEST = 20
 """Functions that call each other."""
+_NO_RESULT = Known("result", "nothing")
 _Function = ast.FunctionDef | ast.Lambda
 
 
 class Body(Calls):
-    """Translates a function for arguments of certain types.
+    """Translates a function for arguments of certain shapes.
 
     Args:
         program: What all functions share.
         node: The function.
-        arguments: Types of its arguments, by name.
-        parent: The function in which it is defined, None where that is the file.
+        arguments: Shapes of its arguments, by name.
+        parent: The function or module in which it is defined.
 
     Attributes:
-        result: Type of its result; None: it gives none.
-        text: Its C++ body.
+        result: Shape of its result.
+        text: Its C++ body, which gives references to the numbers of its result their values.
     """
 
-    def __init__(self, program: Program, node: _Function, arguments: dict[str, Any], parent: Body | None) -> None:
-        self.program, self.node, self.parent = program, node, parent
-        self.arguments = arguments
+    def __init__(self, program: Module, node: _Function, arguments: dict[str, Value], parent: Any) -> None:
+        self.program, self.node, self.parent, self.arguments = program, node, parent, arguments
         self.label = program.number()
+        if self.label > _MOST_NAMES:  # functions that call functions many times over
+            raise Outside(node, "a function that is too long with all that it calls")
         self.local = _local(node)
-        self.slots: dict[str, Any] = dict(arguments)
-        self.flagged: set[str] = set()
-        self.result: Any = None
+        self.slots = dict(arguments)
+        self.flagged = set()
+        self.result: Value = _NO_RESULT
         self.text = self._passes()
 
     def _passes(self) -> list[str]:
-        """Translate until the types of all variables stay what they are."""
+        """Translate until the shapes of all variables stay what they are."""
         for _ in range(_MOST_PASSES):
-            before = (dict(self.slots), set(self.flagged), self.result)
-            self.lines: list[str] = []
-            self.overlay: list[dict[str, Value]] = []
-            self.assigned = set(self.arguments)
-            self.may_fail = False
+            before = repr((self.slots, sorted(self.flagged), self.result))
+            self.lines, self.assigned, self.may_fail = [], set(self.arguments), False
             if isinstance(self.node, ast.Lambda):
                 self._give(self.expression(self.node.body), self.node.body)
-                ended = True
-            else:
-                ended = self.block(self.node.body)
-            if not ended:
-                self._nothing(self.node)
-            if before == (self.slots, self.flagged, self.result):
+            elif not self.block(self.node.body):
+                self._give(None, self.node)
+            if before == repr((self.slots, sorted(self.flagged), self.result)):
                 return [*self._declarations(), *self.lines]
         raise Outside(self.node, "a variable whose type keeps changing")
 
     def _declarations(self) -> list[str]:
-        lines = []
+        lines = [f"bool {self.flag(name)} = false;" for name in sorted(self.flagged)]
         for name, shape in self.slots.items():
-            given = [f"a_{each}" for each in self.variables(name, shape)]
-            widths = flat(self.arguments[name]) if name in self.arguments else []
-            for place, (kind, variable) in enumerate(zip(flat(shape), self.variables(name, shape), strict=True)):
-                first = f"({C_TYPES[kind]}){given[place]}" if widths else "0"
-                lines.append(f"{C_TYPES[kind]} {variable} = {first};")
-        return [*lines, *(f"bool {self.flag(name)} = false;" for name in sorted(self.flagged))]
+            for kind, place in zip(flat(shape), self.places(name, shape), strict=True):
+                first = f"({C_TYPES[kind]})a_{place}" if name in self.arguments else "0"
+                lines.append(f"{C_TYPES[kind]} {place} = {first};")
+        return lines
 
     @property
     def parameters(self) -> str:
-        """The C++ parameters."""
-        return ", ".join(
-            f"{C_TYPES[kind]} a_{variable}"
+        """The C++ parameters: the numbers of the arguments, and references to those of the result."""
+        pairs = [
+            (kind, f"a_{place}")
             for name, shape in self.arguments.items()
-            for kind, variable in zip(flat(shape), self.variables(name, shape), strict=True)
-        )
-
-    @property
-    def returns(self) -> str:
-        """The C++ type of the result."""
-        if isinstance(self.result, str):
-            return C_TYPES[self.result]
-        return self.program.struct(flat(self.result)) if flat(self.result) else "bool"
+            for kind, place in zip(flat(shape), self.places(name, shape), strict=True)
+        ]
+        results = [(kind, f"&r{self.label}_{place}") for place, kind in enumerate(flat(self.result))]
+        return ", ".join(f"{C_TYPES[kind]} {name}" for kind, name in (*pairs, *results))
 
     # calls of functions of the file
 
-    def apply(self, function: Thing, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST) -> Value:
-        """The result of a function of the file, which is translated for the types of these arguments."""
-        given = self._matched(function, arguments, named, node)
+    def apply(self, function: Function, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST) -> Value:
+        """The result of a function of the file, which is translated for the shapes of these arguments."""
+        try:
+            bound = function.signature.bind(*arguments, **named)
+        except TypeError:
+            raise Outside(node, f"a call of {function.name}() that does not fit its parameters") from None
+        bound.apply_defaults()
+        values = bound.arguments
         if function.node in self.program.running or len(self.program.running) > _DEEPEST:
             raise Outside(node, f"{function.name}(), which calls itself")
-        for value in given.values():
-            _check_kept(value, node)
-        shapes = {name: shape_of(value) for name, value in given.items()}
-        values = ", ".join(code for name, value in given.items() for code in codes(value, shapes[name]))
-        key = (function.node, tuple(shapes.items()))
-        if key in self.program.known:
-            called, result, returns = self.program.known[key]
+        shapes = {name: shape_of(value) for name, value in values.items()}
+        key = function.node, repr(shapes)
+        if key in self.program.translated:
+            called, result = self.program.translated[key]
         else:
             self.program.running.append(function.node)
             body = Body(self.program, function.node, shapes, function.scope)
             self.program.running.pop()
-            result, returns = body.result, body.returns
-            text = f"[&]({body.parameters}) -> {returns} {{ {' '.join(body.text)} }}"
-            if function.scope is None and not any(map(_sees, given.values())):
+            called, result = f"[&]({body.parameters}) {{ {' '.join(body.text)} }}", body.result
+            if isinstance(function.scope, Module) and not any(map(_sees, values.values())):
+                self.program.functions.append(f"auto f{body.label} = {called};")
                 called = f"f{body.label}"
-                self.program.functions.append(f"auto {called} = {text};")
-                self.program.known[key] = (called, result, returns)
-            else:
-                called = text  # it sees the variables of the function around it, and so stays where it is called
+                self.program.translated[key] = called, result
+            # else it sees the variables of the function around it, and so stays where it is called
+        names = self.variables(result)
+        codes = [code for name, value in values.items() for code in self.codes(value, shapes[name])]
+        self.emit(f"{called}({', '.join([*codes, *names])});")
         self.may_fail = True
-        if result is None or not flat(result):
-            self.emit(f"{called}({values});")
-            return self.program.wrap(None, node) if result is None else rebuilt(result, [])
-        name = self.fresh()
-        self.emit(f"const {returns} {name} = {called}({values});")
-        if isinstance(result, str):
-            return rebuilt(result, [name])
-        return rebuilt(result, [f"{name}.a{place}" for place in range(len(flat(result)))])
-
-    def _matched(
-        self, function: Thing, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST
-    ) -> dict[str, Value]:
-        """The arguments of a call by the names of the function's parameters."""
-        found = function.node.args
-        if found.vararg or found.kwarg:
-            raise Outside(function.node, "a function with * or **")
-        if getattr(function.node, "decorator_list", None):
-            raise Outside(function.node, "a decorated function")
-        names = [each.arg for each in (*found.posonlyargs, *found.args)]
-        given = dict(zip(names, arguments, strict=False))
-        every = [*names, *(each.arg for each in found.kwonlyargs)]
-        if len(arguments) > len(names) or set(named) - set(every) or set(named) & set(given):
-            raise Outside(node, f"a call of {function.name}() that does not fit its parameters")
-        given |= named
-        defaults = dict(zip(names[len(names) - len(found.defaults) :], found.defaults, strict=True))
-        defaults |= {each.arg: value for each, value in zip(found.kwonlyargs, found.kw_defaults, strict=True) if value}
-        for name, default in defaults.items():
-            if name not in given:
-                given[name] = self.program.wrap(self.constant(default), default)
-        if missing := [name for name in every if name not in given]:
-            raise Outside(node, f"a call of {function.name}() without {missing[0]}")
-        return {name: given[name] for name in every}
+        return rebuilt(result, iter(names))
 
     # statements
 
@@ -167,7 +128,7 @@ class Body(Calls):
         for statement in statements:
             method: Callable[[Any], bool | None] | None = getattr(self, f"_on_{type(statement).__name__}", None)
             if method is None:
-                raise Outside(statement, _TOLD.get(type(statement).__name__, f"a {type(statement).__name__} statement"))
+                raise Outside(statement, _REFUSED.get(type(statement).__name__, "a statement that is not translated"))
             if method(statement):
                 return True
             self.check()
@@ -180,110 +141,85 @@ class Body(Calls):
         if not isinstance(node.value, ast.Constant):
             self.expression(node.value)
 
-    def _on_Import(self, node: ast.Import) -> None:
-        for alias in node.names:
-            name = alias.asname or alias.name.partition(".")[0]
-            self.store(name, Thing("module", alias.name if alias.asname else name), node)
+    def _on_Import(self, node: ast.Import | ast.ImportFrom) -> None:
+        for name, value in imported(node).items():
+            self.store(name, value, node)
+
+    _on_ImportFrom = _on_Import
 
     def _on_FunctionDef(self, node: ast.FunctionDef) -> None:
-        self.store(node.name, Thing("function", node.name, node, self), node)
+        self.store(node.name, self.function(node.name, node, self), node)
 
     def _on_Assign(self, node: ast.Assign) -> None:
-        if all(isinstance(target, ast.Name) for target in node.targets):
-            value = self._value(node.value)
-        else:
-            value = self.hold(self._value(node.value))
+        value = self.expression(node.value)
+        if not all(isinstance(target, ast.Name) for target in node.targets):
+            value = self.hold(value)
         for target in node.targets:
             self.unpack(target, value, self.store)
-
-    def _value(self, node: ast.expr) -> Value:
-        return self._Lambda(node) if isinstance(node, ast.Lambda) else self.expression(node)
 
     def _on_AnnAssign(self, node: ast.AnnAssign) -> None:
         if node.value is not None:
             self.unpack(node.target, self.expression(node.value), self.store)
 
     def _on_AugAssign(self, node: ast.AugAssign) -> None:
-        if not isinstance(node.target, ast.Name):
+        old = self.lookup(node.target.id, node) if isinstance(node.target, ast.Name) else []
+        if isinstance(old, list | Series):
             raise Outside(node, "a list or an object that is changed")
-        old = self.lookup(node.target.id, node)
-        self.store(node.target.id, self.binary(node.op, old, self.expression(node.value), node), node)
+        self.unpack(node.target, self.binary(node.op, old, self.expression(node.value), node), self.store)
 
     def store(self, name: str, value: Value, node: ast.AST) -> None:
         """Assign a value to a local variable."""
-        _check_kept(value, node)
-        shape = shape_of(value)
-        old: Any = self.slots.get(name)
-        new = shape if old is None else joined(old, shape)
-        if new is None:
-            raise Outside(node, f"{name}, which is {described(old)} and then {described(shape)}")
-        self.slots[name] = new
-        places, values = self.variables(name, new), codes(value, new)
+        shape = kept(value, node)
+        if name in self.slots:
+            shape = self.join(self.slots[name], shape, node, f"{name}, which is {{}} and then {{}}")
+        self.slots[name] = shape
+        places, codes = self.places(name, shape), self.codes(value, shape)
         if len(places) > 1:  # an item may be worked out from another one
-            values = [
-                code if code.startswith("t") else self._kept(kind, code)
-                for kind, code in zip(flat(new), values, strict=True)
-            ]
-        self.lines += [f"{place} = {code};" for place, code in zip(places, values, strict=True)]
+            codes = [self.variable(*each) for each in zip(flat(shape), codes, strict=True)]
+        self.emit(*map("{} = {};".format, places, codes))
         if name in self.flagged:
             self.emit(f"{self.flag(name)} = true;")
         self.assigned.add(name)
 
-    def _kept(self, kind: str, code: str) -> str:
-        name = self.fresh()
-        self.emit(f"const {C_TYPES[kind]} {name} = {code};")
-        return name
-
     def _on_Return(self, node: ast.Return) -> bool:
-        if node.value is None:
-            self._nothing(node)
-        else:
-            value = self.expression(node.value)
-            if isinstance(value, Constant) and value.value is None:
-                self._nothing(node)
-            else:
-                self._give(value, node)
+        self._give(None if node.value is None else self.expression(node.value), node)
         return True
 
-    def _nothing(self, node: ast.AST) -> None:
-        """The result None: an error of reward_function, which some calls of other functions may well give."""
-        if self.result is not None:
-            if len(self.program.running) > 1:  # not reward_function itself
-                raise Outside(node, f"a function that returns {described(self.result)} or None")
-            self.emit(f"py_fail({self.at(node)} + {NO_RESULT});")
-        self.emit("return {};")
-
     def _give(self, value: Value, node: ast.AST) -> None:
-        _check_kept(value, node)
+        """Leave the function with a result; None is an error of reward_function, which some calls of it may well give."""
+        if value is None and len(self.program.running) == 1:
+            self.emit(f"py_fail({self.at(node, NO_RESULT)});", "return;")
+            return
         if _sees(value):
             raise Outside(node, "a function that returns a function")
-        shape = shape_of(value)
-        result = shape if self.result is None else joined(self.result, shape)
-        if result is None:
-            raise Outside(node, f"a function that returns {described(self.result)} or {described(shape)}")
-        self.result = result
-        values = ", ".join(codes(value, result))
-        if isinstance(result, str):
-            self.emit(f"return {values};")
-        else:
-            self.emit(f"return {self.returns}{{{values}}};" if values else "return {};")
+        shape = kept(value, node)
+        if self.result is not _NO_RESULT:
+            shape = self.join(self.result, shape, node, "a function that returns {} or {}")
+        self.result = shape
+        self.emit(
+            *(f"r{self.label}_{place} = {code};" for place, code in enumerate(self.codes(value, shape))), "return;"
+        )
+
+    def _tested(self, node: ast.expr) -> Value:
+        """Whether a statement's condition is true, after a check of its errors."""
+        test = self.condition(node)
+        if self.may_fail:
+            test = self.hold(test)
+            self.check()
+        return test
 
     def _on_If(self, node: ast.If) -> bool:
-        test = self.condition(node.test)
-        if test.constant is not None:
-            return self.block(node.body if test.constant else node.orelse)
-        if self.may_fail:
-            test = self.numeric(self.hold(test), node)
-            self.check()
+        test = self._tested(node.test)
+        if not isinstance(test, Number):
+            return self.block(node.body if test else node.orelse)
         before = set(self.assigned)
-        self.emit(f"if {parenthesised(test.code)} {{")
+        self.emit(f"if ((bool){test.code}) {{")
         first = self.block(node.body)
-        left, self.assigned = self.assigned, set(before)
+        left, self.assigned = self.assigned, before
         self.emit("} else {")
         second = self.block(node.orelse)
         self.emit("}")
-        right = self.assigned
-        self.assigned = right if first else left if second else left & right
+        self.assigned = self.assigned if first else left if second else left & self.assigned
         return first and second
 
     def _on_For(self, node: ast.For) -> None:
@@ -303,77 +239,171 @@ class Body(Calls):
         if node.orelse:
             raise Outside(node, "while … else")
         before = set(self.assigned)
-        self.emit("while (true) {")
-        self.emit(self.round(node))
-        test = self.condition(node.test)
-        if test.constant is None:
-            test = self.numeric(self.hold(test), node)
-            self.check()
-        if test.constant is not True:
-            self.emit(f"if (!{test.code}) break;")
+        self.emit("while (true) {", self.round(node))
+        test = self._tested(node.test)
+        if test is not True:
+            self.emit(f"if (!{self.code(test, 'bool')}) break;")
         self.block(node.body)
         self.emit("}")
         self.assigned = before
-        return test.constant is True and not any(_breaks(each) for each in node.body)
+        return test is True and not any(map(_breaks, node.body))
 
-    def _on_Break(self, node: ast.Break) -> bool:
-        self.emit("break;")
+    def _on_Break(self, node: ast.Break | ast.Continue) -> bool:
+        self.emit(f"{type(node).__name__.lower()};")
         return True
 
-    def _on_Continue(self, node: ast.Continue) -> bool:
-        self.emit("continue;")
-        return True
+    _on_Continue = _on_Break
 
 
-def _check_kept(value: Value, node: ast.AST) -> None:
-    """Refuse what holds good only where it is written."""
-    if isinstance(value, Thing) and value.kind == "iterated":
-        raise Outside(node, f"{value.name} that is kept for later")
-    for item in value.items if isinstance(value, ItemList) else ():
-        _check_kept(item, node)
+class Module(Body):
+    """Translates the statements of a module, whose names have to be constants or functions.
+
+    Args:
+        tree: Its syntax tree.
+
+    Attributes:
+        names: What its names stand for; :class:`Outside` where that is not translated.
+        tables: Names of the C++ arrays of constant lists, by their text.
+        texts: Numbers of the texts.
+        functions: C++ of the functions that are called, in order.
+        translated: C++ name and shape of the result of each function, by its node and the shapes of its arguments.
+        running: The functions that are being translated, innermost last.
+        notes: What is left out, a line each.
+    """
+
+    def __init__(self, tree: ast.Module) -> None:
+        self.program, self.parent, self.label = self, None, 0
+        self.lines, self.local, self.may_fail = [], set(), False
+        self.names: dict[str, Value] = {}
+        self.tables: dict[str, str] = {}
+        self.texts: dict[str, int] = {}
+        self.functions: list[str] = []
+        self.translated: dict[Any, tuple[str, Value]] = {}
+        self.running: list[ast.AST] = []
+        self.notes: dict[str, None] = {}
+        self._starred: set[str] = set()
+        self._count = 0
+        for statement in tree.body:
+            _check_harmless(statement)
+            try:
+                self._define(statement)
+            except Outside as outside:
+                if isinstance(statement, ast.Import | ast.ImportFrom):
+                    raise
+                nodes = [each for each in ast.walk(statement) if isinstance(each, ast.Name)]
+                stored = [each.id for each in nodes if not isinstance(each.ctx, ast.Load)]
+                name = getattr(statement, "name", "")  # of a function
+                self.names |= dict.fromkeys([name] if name else stored, outside)
+        for node in ast.walk(tree):
+            for name in node.names if isinstance(node, ast.Global) else ():
+                self.names[name] = Outside(node, f"the global variable {name}, which keeps its value")
+            if isinstance(node, ast.Name | ast.arg) and getattr(node, "id", getattr(node, "arg", "")).startswith("py_"):
+                raise Outside(node, "a name that begins with py_")
+
+    def number(self) -> int:
+        """A number that no other name has."""
+        self._count += 1
+        return self._count
+
+    def lookup(self, name: str, node: ast.AST) -> Value:
+        """The value of a name of the module, or of one that is built in."""
+        if name not in self.names and name not in BUILTINS:
+            raise Outside(node, f"the name {name}")
+        value = self.names.get(name, Known("builtin", name))
+        if isinstance(value, Outside):
+            raise Outside(node, value.reason)
+        return value
+
+    def _define(self, statement: ast.stmt) -> None:
+        if isinstance(statement, ast.ClassDef):
+            self.names[statement.name] = Outside(statement, f"an object of the class {statement.name}")
+        elif isinstance(
+            statement, ast.FunctionDef | ast.Import | ast.ImportFrom | ast.Assign | ast.AnnAssign | ast.Expr
+        ):
+            self.block([statement])
+            if self.lines:
+                self.lines = []
+                raise Outside(statement, "a value that is worked out when the module is imported")
+        else:
+            raise Outside(statement, "a name that such a statement of the module sets")
+
+    def _on_ImportFrom(self, node: ast.Import | ast.ImportFrom) -> None:
+        self._on_Import(node)
+        self._starred |= set(imported(node)) if node.names[0].name == "*" else set()
+
+    def store(self, name: str, value: Value, node: ast.AST) -> None:
+        """Give a name of the module its value, once."""
+        if not is_known(value) and not isinstance(value, Function | Known):
+            raise Outside(node, "a value that is worked out when the module is imported")
+        if name in self.names and name not in self._starred:
+            value = Outside(node, f"{name}, which the module sets more than once")
+        self._starred.discard(name)
+        self.names[name] = value
+
+
+def imported(statement: ast.Import | ast.ImportFrom) -> dict[str, Value]:
+    """The names that an import defines."""
+    if isinstance(statement, ast.Import):
+        pairs = [(each.asname or each.name.partition(".")[0], each) for each in statement.names]
+        return {name: Known("module", each.name if each.asname else name) for name, each in pairs}
+    names = {each.asname or each.name: each.name for each in statement.names}
+    if "*" in names:
+        if statement.module != "math":
+            raise Outside(statement, f"from {statement.module} import *")
+        names = {name: name for name in vars(math) if not name.startswith("_")}
+    is_math = statement.module == "math"
+    return {
+        name: CONSTANTS[each] if is_math and each in CONSTANTS else Known("builtin", f"{statement.module}.{each}")
+        for name, each in names.items()
+    }
+
+
+def _check_harmless(statement: ast.stmt) -> None:
+    """Refuse a statement of the module that may change a value: what is constant would be unknown."""
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef | ast.AsyncFunctionDef):
+        return
+    for node in ast.walk(statement):
+        called = node.value if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call) else None
+        prints = called is not None and isinstance(called.func, ast.Name) and called.func.id == "print"
+        stores = isinstance(node, ast.Subscript | ast.Attribute) and not isinstance(node.ctx, ast.Load)
+        if stores or (called is not None and not prints):
+            raise Outside(node, "a statement of the module that changes something")
 
 
 def _sees(value: Value) -> bool:
     """Whether a value is, or holds, a function that sees the variables of the function around it."""
-    if isinstance(value, ItemList):
-        return any(map(_sees, value.items))
-    return isinstance(value, Thing) and value.scope is not None
+    if isinstance(value, list | tuple):
+        return any(map(_sees, value))
+    return isinstance(value, Function) and not isinstance(value.scope, Module)
 
 
 def _breaks(node: ast.AST) -> bool:
     """Whether a statement of a loop's body leaves that loop."""
-    if isinstance(node, ast.Break):
-        return True
     if isinstance(node, ast.For | ast.While | ast.FunctionDef | ast.Lambda):
         return False
-    return any(_breaks(child) for child in ast.iter_child_nodes(node))
+    return isinstance(node, ast.Break) or any(map(_breaks, ast.iter_child_nodes(node)))
 
 
 def _local(node: _Function) -> set[str]:
     """Names of a function's own variables."""
-    arguments = node.args
-    names = {each.arg for each in (*arguments.posonlyargs, *arguments.args, *arguments.kwonlyargs)}
-    waiting: list[ast.AST] = list(node.body) if isinstance(node, ast.FunctionDef) else []
-    while waiting:
-        each = waiting.pop()
-        if isinstance(each, ast.Nonlocal):
-            raise Outside(each, "nonlocal")
-        if isinstance(each, ast.Global):
-            raise Outside(each, f"the global variable {each.names[0]}, which keeps its value")
+    names = {each.arg for each in ast.walk(node.args) if isinstance(each, ast.arg)}
+    nodes: list[ast.AST] = list(node.body) if isinstance(node, ast.FunctionDef) else []
+    for each in nodes:
+        if isinstance(each, ast.Nonlocal | ast.Global):
+            kind = "nonlocal" if isinstance(each, ast.Nonlocal) else "global"
+            raise Outside(each, f"the {kind} variable {each.names[0]}, which keeps its value")
         if isinstance(each, ast.FunctionDef | ast.ClassDef):
             names.add(each.name)
-            continue
-        if isinstance(each, ast.Lambda | ast.ListComp | ast.GeneratorExp | ast.SetComp | ast.DictComp):
-            continue
-        if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store):
-            names.add(each.id)
-        if isinstance(each, ast.Import | ast.ImportFrom):
-            names |= {alias.asname or alias.name.partition(".")[0] for alias in each.names}
-        waiting += ast.iter_child_nodes(each)
+        elif not isinstance(each, ast.Lambda | ast.ListComp | ast.GeneratorExp | ast.SetComp | ast.DictComp):
+            if isinstance(each, ast.Name) and isinstance(each.ctx, ast.Store):
+                names.add(each.id)
+            elif isinstance(each, ast.Import | ast.ImportFrom):
+                names |= set(imported(each))
+            nodes += ast.iter_child_nodes(each)
     return names
 
 
-_TOLD = {
+_REFUSED = {
     "Try": "try and except",
     "With": "with",
     "Raise": "raise",
@@ -381,5 +411,4 @@ _TOLD = {
     "Delete": "del",
     "ClassDef": "a class",
     "Match": "match",
-    "ImportFrom": "an import inside a function",
 }

@@ -1,41 +1,83 @@
-"""Calls in a reward function: built-in functions, those of modules, its own, and what is worked out over many items."""
+"""Calls in a reward function: built-in functions, those of modules, and what is worked out over many items."""
 
 from __future__ import annotations
 
 import ast
+import builtins
+import copy
 import inspect
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Sequence
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME
-from racer.rewards.translation.expression_values import (
-    C_TYPES,
+from racer.rewards.translation.expressions import Expressions, fits
+from racer.rewards.translation.prelude import EMPTY, FUNCTIONS
+from racer.rewards.translation.values import (
+    KINDS,
     LONGEST_GROUP,
-    Constant,
-    ItemList,
+    PARAMS,
+    Function,
+    Known,
     Number,
     Outside,
-    RuntimeList,
-    Thing,
+    Series,
     Value,
-    cast,
-    codes,
     described,
-    flat,
+    is_known,
     joined,
-    number,
-    parenthesised,
-    rebuilt,
-    shape_of,
+    kept,
 )
-from racer.rewards.translation.expressions import Expressions
-from racer.rewards.translation.items import Iterated
-from racer.rewards.translation.mathematics import FUNCTIONS, QUIET
-from racer.rewards.translation.prelude import EMPTY
 from shared_store.contract.error_text import counted
 
-_FOLDS = {"sum": "start", "min": "default", "max": "default", "any": None, "all": None, "len": None}
-"""The option that each of them has beside ``key``."""
+BUILTINS = {
+    *("abs", "all", "any", "bool", "divmod", "enumerate", "float", "int", "len", "list", "max", "min", "pow", "print"),
+    *("range", "reversed", "round", "str", "sum", "tuple", "zip", "py_empty"),
+}
+_LEAST = """
+def min(py_items, py_key=None, py_default=...):
+    py_found = False
+    for py_item in py_items:
+        py_rank = py_item if py_key is None else py_key(py_item)
+        if not py_found or py_rank < py_least:
+            py_best, py_least, py_found = py_item, py_rank, True
+    if not py_found:
+        if py_default is ...:
+            py_empty()
+        else:
+            return py_default
+    return py_best
+"""
+_LOOPS: dict[str, ast.FunctionDef] = {
+    each.name: each
+    for each in ast.parse(
+        f"""
+def sum(py_items, py_start=0):
+    for py_item in py_items:
+        py_start = py_start + py_item
+    return py_start
+def any(py_items):
+    for py_item in py_items:
+        if py_item:
+            return True
+    return False
+def all(py_items):
+    for py_item in py_items:
+        if not py_item:
+            return False
+    return True
+def contains(py_items, py_value):
+    for py_item in py_items:
+        if py_item == py_value:
+            return True
+    return False
+{_LEAST}{_LEAST.replace("min", "max").replace("<", ">")}"""
+    ).body
+    if isinstance(each, ast.FunctionDef)
+}
+"""Functions of many items in Python, which are translated where they are called."""
+_OF_KNOWN = {"abs", "all", "any", "bool", "divmod", "len", "list", "max", "min", "round", "sum", "tuple"}
+"""Built-in functions whose result is Python's own where all that they are given is known."""
 _Comprehension = ast.GeneratorExp | ast.ListComp
 
 
@@ -43,162 +85,234 @@ class Calls(Expressions):
     """Translates calls."""
 
     def _Call(self, node: ast.Call) -> Value:
-        if any(isinstance(each, ast.Starred) for each in node.args) or any(each.arg is None for each in node.keywords):
-            raise Outside(node, "a call with * or **")
         if isinstance(node.func, ast.Attribute):
-            return self._method(node, node.func)
-        return self.called(self.expression(node.func), node)
-
-    def _method(self, node: ast.Call, function: ast.Attribute) -> Value:
-        base = self.expression(function.value)
-        if isinstance(base, Thing) and base.kind == "module":
-            return self.called(self.expression(function), node)
-        if function.attr == "get" and not node.keywords and 1 <= len(node.args) <= 2:
-            return self._get(base, node)
-        if function.attr in ("append", "extend", "insert"):
-            raise Outside(node, "a list that grows")
-        if function.attr in ("format", "join"):
-            raise Outside(node, "a text that is made when it runs")
-        if isinstance(base, Constant) and isinstance(base.value, dict) and not node.args + node.keywords:
-            entries = base.value
-            parts = {"keys": list(entries), "values": list(entries.values()), "items": list(entries.items())}
-            if function.attr in parts:
-                return self.program.wrap(parts[function.attr], node)
-        raise Outside(node, f"the method {function.attr} of {described(shape_of(base))}")
-
-    def _get(self, base: Value, node: ast.Call) -> Value:
-        key = self.expression(node.args[0])
-        known = key.constant if isinstance(key, Number) else None
-        if known is None:
-            raise Outside(node, "get() of a key that is not known")
-        if isinstance(base, Thing) and base.kind == "params":
-            there = known in BY_NAME
-        elif isinstance(base, Constant) and isinstance(base.value, dict):
-            there = known in base.value
-        else:
-            raise Outside(node, f"get() of {described(shape_of(base))}")
-        if there:
-            return self.item(base, key, node)
-        return self.expression(node.args[1]) if len(node.args) == 2 else self.program.wrap(None, node)
-
-    def called(self, function: Value, node: ast.Call) -> Value:
-        """The result of a call."""
-        if not isinstance(function, Thing) or function.kind not in ("builtin", "function"):
-            raise Outside(node, f"a call of {described(shape_of(function))}")
-        if function.kind == "function":
+            base = self.expression(node.func.value)
+            if not isinstance(base, Known) or base.kind != "module":
+                return self._method(base, node.func.attr, node)
+        function = self.expression(node.func)
+        if isinstance(function, Function):
+            named = {str(each.arg): self.expression(each.value) for each in node.keywords}
             arguments = [self.expression(each) for each in node.args]
-            named = {each.arg: self.expression(each.value) for each in node.keywords if each.arg}
+            kept([*arguments, *named.values()], node)
             return self.apply(function, arguments, named, node)
-        if function.name == "print":
-            self.program.note(node.lineno, "print() is left out")
-            return self.program.wrap(None, node)
-        if function.name in _FOLDS and len(node.args) >= 1 and isinstance(node.args[0], _Comprehension):
-            return self._folded(function.name, node, node.args[0])
-        if function.name in ("min", "max") and any(each.arg in ("key", "default") for each in node.keywords):
-            return self._best(function.name, node)
-        if node.keywords:
-            raise Outside(node, f"{function.name}() with {node.keywords[0].arg}=")
-        method: Callable[..., Value] | None = getattr(self, f"_{function.name}", None)
-        arguments = [self.expression(each) for each in node.args]
-        if method is not None and "." not in function.name:
-            try:
-                inspect.signature(method).bind(node, *arguments)
-            except TypeError:
-                raise Outside(node, f"{function.name}() with {counted(len(arguments), 'argument')}") from None
-            return method(node, *arguments)
-        return self._mathematical(function.name, arguments, node)
+        if not isinstance(function, Known) or function.kind != "builtin":
+            raise Outside(node, f"a call of {described(function)}")
+        return self._built_in(function.name, node)
 
-    def apply(self, function: Thing, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST) -> Value:
-        """The result of a function of the file. Each file's translation defines it."""
+    def apply(self, function: Function, arguments: Sequence[Value], named: dict[str, Value], node: ast.AST) -> Value:
+        """The result of a function of the file."""
         raise NotImplementedError
 
+    def _method(self, base: Value, name: str, node: ast.Call) -> Value:
+        if name in ("append", "extend", "insert"):
+            raise Outside(node, "a list that grows")
+        if name in ("format", "join"):
+            raise Outside(node, "a text that is made when it runs")
+        if isinstance(base, dict) and name in ("keys", "values", "items") and not node.args + node.keywords:
+            return list(getattr(base, name)())
+        if name != "get" or node.keywords or not 1 <= len(node.args) <= 2:
+            raise Outside(node, f"the method {name} of {described(base)}")
+        if base is not PARAMS and not isinstance(base, dict):
+            raise Outside(node, f"get() of {described(base)}")
+        key = self.expression(node.args[0])
+        if type(key) not in KINDS:
+            raise Outside(node, "get() of a key that is not known")
+        if key in (base if isinstance(base, dict) else BY_NAME):
+            return self.item(base, key, node)
+        return self.expression(node.args[1]) if len(node.args) == 2 else None
+
+    def _built_in(self, name: str, node: ast.Call) -> Value:
+        if name == "print":
+            self.program.notes[f"line {node.lineno}: print() is left out"] = None
+            return None
+        if name == "py_empty":
+            self.emit(f"py_fail({self.at(node, EMPTY)});")
+            return None
+        if name in _LOOPS:
+            return self._over_items(name, node)
+        if name == "len" and node.args and isinstance(node.args[0], ast.ListComp):
+            counting = ast.copy_location(ast.GeneratorExp(ast.Constant(1), node.args[0].generators), node)
+            return self.reduced("sum", node, counting, {})
+        if node.keywords:
+            raise Outside(node, f"{name}() with {node.keywords[0].arg}=")
+        arguments = [self.expression(each) for each in node.args]
+        if (value := _of_known(name, arguments)) is not ...:
+            return value
+        method = getattr(self, f"_{name}", None) if name in BUILTINS else None
+        if method is None:
+            return self._mathematical(name, arguments, node)
+        try:
+            inspect.signature(method).bind(node, *arguments)
+        except TypeError:
+            raise Outside(node, f"{name}() with {counted(len(arguments), 'argument')}") from None
+        return method(node, *arguments)
+
+    def _over_items(self, name: str, node: ast.Call) -> Value:
+        """``sum``, ``any``, ``all``, ``min`` or ``max``."""
+        options = {f"py_{each.arg}": self.expression(each.value) for each in node.keywords}
+        arguments = [each if isinstance(each, _Comprehension) else self.expression(each) for each in node.args]
+        if not options and (value := _of_known(name, arguments)) is not ...:
+            return value
+        if name == "sum" and len(arguments) == 2:
+            options["py_start"] = arguments.pop()
+        is_extreme = name in ("min", "max") and not options
+        items = arguments if len(arguments) > 1 else arguments[0] if arguments else None
+        if is_extreme and isinstance(items, list | tuple) and not any(isinstance(each, ast.AST) for each in items):
+            return self._extreme(name, node, items)
+        if len(arguments) != 1 or set(options) - {each.arg for each in _LOOPS[name].args.args}:
+            raise Outside(node, f"{name}() in this form")
+        return self.reduced(name, node, items, options)
+
+    def reduced(self, name: str, node: ast.AST, source: Any, options: dict[str, Value]) -> Value:
+        """The result of one of :data:`_LOOPS`, whose loop becomes those of a generator where ``source`` is one."""
+        function = copy.deepcopy(_LOOPS[name])
+        for each in ast.walk(function):
+            ast.copy_location(each, node)
+        if isinstance(source, _Comprehension):
+            place = next(place for place, each in enumerate(function.body) if isinstance(each, ast.For))
+            loop = function.body[place]
+            assert isinstance(loop, ast.For)
+            body: list[ast.stmt] = [ast.Assign([loop.target], source.elt), *loop.body]
+            for generator in reversed(source.generators):
+                for test in reversed(generator.ifs):
+                    body = [ast.If(test, body, [])]
+                body = [outer := ast.For(generator.target, generator.iter, body, [])]
+            outer.iter, source = loop.iter, self.expression(outer.iter)  # worked out outside, as in Python
+            function.body[place] = ast.fix_missing_locations(ast.copy_location(outer, node))
+        return self.apply(self.function(name, function, self), [source], options, node)
+
+    def _ListComp(self, node: ast.ListComp) -> Value:
+        """A list of known length, item by item."""
+        generator = node.generators[0]
+        found = self.series(self.expression(generator.iter), node)
+        is_short = isinstance(found.length, int) and found.length <= LONGEST_GROUP
+        if len(node.generators) > 1 or generator.ifs or not is_short:
+            raise Outside(node, "a list that grows")
+        item = ast.Name("py_item", ast.Load())
+        body: list[ast.stmt] = [ast.Assign([generator.target], item), ast.Return(node.elt)]
+        text = ast.FunctionDef("list", ast.parse("lambda py_item: 0", mode="eval").body.args, body, [])  # type: ignore[attr-defined]
+        function = self.function("list", ast.fix_missing_locations(ast.copy_location(text, node)), self)
+        return [self.apply(function, [found.item(index)], {}, node) for index in range(found.length)]
+
+    def unpack(self, target: ast.expr, value: Value, store: Any) -> None:
+        """Give the names of a target their values."""
+        if isinstance(target, ast.Name):
+            store(target.id, value, target)
+        elif isinstance(target, ast.Tuple | ast.List):
+            if not isinstance(value, list | tuple) or len(value) != len(target.elts):
+                raise Outside(target, f"{len(target.elts)} names for {described(value)}")
+            for each, item in zip(target.elts, value, strict=True):
+                self.unpack(each, item, store)
+        else:
+            raise Outside(target, "a list whose items are changed" if isinstance(target, ast.Subscript) else "a target")
+
+    def function(self, name: str, node: ast.FunctionDef | ast.Lambda, scope: Any) -> Function:
+        """A function that is defined here, with the defaults of its parameters."""
+        found, kinds = node.args, inspect.Parameter
+        places = [*found.posonlyargs, *found.args]
+        defaults = dict(zip(reversed(places), map(self.expression, reversed(found.defaults)), strict=False))
+        defaults |= {
+            each: self.expression(default)
+            for each, default in zip(found.kwonlyargs, found.kw_defaults, strict=True)
+            if default
+        }
+        if not is_known([*defaults.values()]):
+            raise Outside(node, "a default that is no constant")
+        if found.vararg or found.kwarg or getattr(node, "decorator_list", None):
+            raise Outside(node, "a decorated function, or one with * or **")
+        kind: dict[ast.arg, Any] = dict.fromkeys(places, kinds.POSITIONAL_OR_KEYWORD)
+        kind |= dict.fromkeys(found.posonlyargs, kinds.POSITIONAL_ONLY) | dict.fromkeys(
+            found.kwonlyargs, kinds.KEYWORD_ONLY
+        )
+        parameters = [kinds(each.arg, of, default=defaults.get(each, kinds.empty)) for each, of in kind.items()]
+        return Function(name, node, scope, inspect.Signature(parameters))
+
+    def _Lambda(self, node: ast.Lambda) -> Value:
+        return self.function("lambda", node, self)
+
+    # functions of numbers
+
     def _mathematical(self, name: str, arguments: Sequence[Value], node: ast.Call) -> Value:
-        module, _, function = name.rpartition(".")
-        table = {"math": FUNCTIONS, "numpy": QUIET}.get(module, {})
         if name in ("math.dist", "math.hypot", "numpy.hypot", "numpy.linalg.norm"):
             return self._distance(name, arguments, node)
-        if function not in table:
+        if name == "math.log" and len(arguments) == 2:
+            parts = [self._mathematical(name, [each], node) for each in arguments]
+            return self.binary(ast.Div(), parts[0], parts[1], node)
+        module, _, function = name.rpartition(".")
+        code = FUNCTIONS.get(module, {}).get(function)
+        if code is None:
             raise Outside(node, f"{name}()")
-        found = table[function]
-        if len(arguments) not in found.counts:
+        if len(arguments) != 1 + ("{1}" in code) + ("{2}" in code):
             raise Outside(node, f"{name}() with {counted(len(arguments), 'argument')}")
-        numbers = [self.numeric(each, node) for each in arguments]
-        held = [self.hold(each) for each in numbers]
-        at = self.at(node) if found.may_fail else ""
-        return found.make([cast(self.numeric(each, node), "float") for each in held], at)
+        values = [self.code(self._float(node, self.hold(each)), "float") for each in arguments]
+        kind = "int" if code.startswith("py_int(") else "bool" if function.startswith("is") else "float"
+        return Number(kind, code.format(*values, at=self.at(node) if "{at}" in code else ""))
 
     def _distance(self, name: str, arguments: Sequence[Value], node: ast.Call) -> Value:
-        parts: Sequence[Value] = arguments
-        if name == "math.dist" and len(arguments) == 2:
-            one, other = arguments
-            if not (isinstance(one, ItemList) and isinstance(other, ItemList) and len(one.items) == len(other.items)):
+        parts = arguments
+        groups = [each for each in arguments if isinstance(each, list | tuple)]
+        if name == "math.dist" and len(groups) == len(arguments) == 2:
+            if len(groups[0]) != len(groups[1]):
                 raise Outside(node, "math.dist() of anything but two points")
-            parts = [self.binary(ast.Sub(), *pair, node) for pair in zip(one.items, other.items, strict=True)]
-        elif name == "numpy.linalg.norm" and len(arguments) == 1 and isinstance(arguments[0], ItemList):
-            parts = arguments[0].items
+            parts = [self.binary(ast.Sub(), one, other, node) for one, other in zip(*groups, strict=True)]
+        elif name == "numpy.linalg.norm" and len(groups) == len(arguments) == 1:
+            parts = groups[0]
         elif name != "math.hypot" and (name != "numpy.hypot" or len(arguments) != 2):
             raise Outside(node, f"{name}() in this form")
-        held = [cast(self.numeric(self.hold(self.numeric(part, node)), node), "float") for part in parts]
+        held = [self.code(self._float(node, self.hold(part)), "float") for part in parts]
         return Number("float", f"::sqrt({' + '.join(f'{part} * {part}' for part in held) or '0.0'})")
 
     # built-in functions, by their names
 
     def _abs(self, node: ast.Call, value: Value) -> Value:
-        found = self.numeric(value, node)
-        if found.kind == "float":
-            return Number("float", f"::fabs({found.code})")
-        held = self.numeric(self.hold(Number("int", cast(found, "int"))), node)
-        return Number("int", f"({held.code} < 0 ? -{held.code} : {held.code})")
+        if self.kind(value, node) == "float":
+            return Number("float", f"::fabs({value.code})")
+        held = self.code(self.hold(self._int(node, value)), "int")
+        return Number("int", f"({held} < 0 ? -{held} : {held})")
 
-    def _float(self, node: ast.Call, value: Value | None = None) -> Value:
-        if isinstance(value, Number) and value.kind == "text" and value.constant in ("inf", "-inf", "nan"):
-            return number(float(value.constant))
-        found = number(0.0) if value is None else self.numeric(value, node)
-        return number(float(found.constant)) if found.constant is not None else Number("float", cast(found, "float"))
+    def _float(self, node: ast.Call, value: Value = 0.0) -> Value:
+        if value in ("inf", "-inf", "nan") or (self.kind(value, node) and is_known(value)):
+            return float(value)
+        return Number("float", self.code(value, "float"))
 
-    def _int(self, node: ast.Call, value: Value | None = None) -> Value:
-        found = number(0) if value is None else self.numeric(value, node)
-        if found.kind == "float":
-            return Number("int", f"py_int({found.code}, {self.at(node)})")
-        return Number("int", cast(found, "int"), None if found.constant is None else int(found.constant))
+    def _int(self, node: ast.Call, value: Value = 0) -> Value:
+        if self.kind(value, node) != "float":
+            return int(value) if is_known(value) else Number("int", self.code(value, "int"))
+        return Number("int", f"py_int({self.code(value, 'float')}, {self.at(node)})")
 
-    def _bool(self, node: ast.Call, value: Value | None = None) -> Value:
-        return number(False) if value is None else self.truth(value, node)
+    def _bool(self, node: ast.Call, value: Value = False) -> Value:
+        return self.truth(value, node)
 
-    def _round(self, node: ast.Call, value: Value, digits: Value | None = None) -> Value:
-        found = self.numeric(value, node)
-        places = digits.constant if isinstance(digits, Number) else None
-        if found.kind != "float":
+    def _round(self, node: ast.Call, value: Value, digits: Value = None) -> Value:
+        if self.kind(value, node) != "float":
             if digits is not None:
                 raise Outside(node, "round() of an int with digits")
-            return Number("int", cast(found, "int"))
-        if digits is None or (isinstance(digits, Constant) and digits.value is None):
-            return Number("int", f"py_int(::rint({found.code}), {self.at(node)})")
-        if not isinstance(places, int) or not 0 <= places <= 6:
+            return self._int(node, value)
+        code = self.code(value, "float")
+        if digits is None:
+            return Number("int", f"py_int(::rint({code}), {self.at(node)})")
+        if not isinstance(digits, int) or not 0 <= digits <= 6:
             raise Outside(node, "round() to anything but 0 to 6 digits")
-        return Number("float", f"py_round({found.code}, {places}, {self.at(node)})")
+        return Number("float", f"py_round({code}, {int(digits)})")
 
     def _pow(self, node: ast.Call, base: Value, exponent: Value) -> Value:
         return self.binary(ast.Pow(), base, exponent, node)
 
     def _divmod(self, node: ast.Call, one: Value, other: Value) -> Value:
         one, other = self.hold(one), self.hold(other)
-        return ItemList((self.binary(ast.FloorDiv(), one, other, node), self.binary(ast.Mod(), one, other, node)))
+        return self.binary(ast.FloorDiv(), one, other, node), self.binary(ast.Mod(), one, other, node)
 
     def _len(self, node: ast.Call, value: Value) -> Value:
-        if isinstance(value, Constant) and isinstance(value.value, list | tuple | dict):
-            return number(len(value.value))
-        found = self.iterated(value, node)
-        return number(found.known) if found.known is not None else Number("int", found.length)
+        return len(value) if isinstance(value, dict | list | tuple) else self.series(value, node).length
 
-    def _list(self, node: ast.Call, value: Value | None = None) -> Value:
-        if value is None:
+    def _list(self, node: ast.Call, value: Value = ()) -> Value:
+        if not node.args:
             raise Outside(node, "a list that grows")
-        if isinstance(value, RuntimeList | ItemList) or (
-            isinstance(value, Constant) and isinstance(value.value, list | tuple)
-        ):
+        if isinstance(value, Series) and value.is_list:
             return value
-        raise Outside(node, f"a list of {described(shape_of(value))}")
+        if isinstance(value, list | tuple):
+            return list(value) if getattr(node.func, "id", "") == "list" else tuple(value)
+        raise Outside(node, f"a list of {described(value)}")
 
     _tuple = _list
 
@@ -208,239 +322,62 @@ class Calls(Expressions):
     def _range(self, node: ast.Call, *bounds: Value) -> Value:
         if not 1 <= len(bounds) <= 3:
             raise Outside(node, f"range() with {counted(len(bounds), 'argument')}")
-        numbers = [self.numeric(each, node) for each in bounds]
-        if any(each.kind == "float" for each in numbers):
+        if any(self.kind(each, node) == "float" for each in bounds):
             raise Outside(node, "range() of a float")
-        full = [number(0), *numbers, number(1)] if len(numbers) == 1 else [*numbers, number(1)][:3]
-        first, last, step = (self.numeric(self.hold(each), node) for each in full)
-        known = None
-        if first.constant is not None and last.constant is not None and step.constant:
-            known = len(range(first.constant, last.constant, step.constant))
-        length = (
-            str(known) if known is not None else f"py_steps({first.code}, {last.code}, {step.code}, {self.at(node)})"
+        full = (0, bounds[0], 1) if len(bounds) == 1 else (*bounds, 1)[:3]
+        codes = [self.code(self.hold(each), "int") for each in full]
+        if is_known(full) and full[2]:
+            length: Value = len(range(*full))
+        else:
+            length = Number("int", f"py_steps({', '.join(codes)}, {self.at(node)})")
+        return Series(
+            "a range", length, lambda index: Number("int", f"({codes[0]} + {self.code(index, 'int')} * {codes[2]})")
         )
-        scope = Iterated(length, lambda index: Number("int", f"({first.code} + {index} * {step.code})"), known)
-        return Thing("iterated", "a range", node, scope)
 
-    def _enumerate(self, node: ast.Call, value: Value, start: Value | None = None) -> Value:
-        found, first = self.iterated(value, node), number(0) if start is None else self.numeric(start, node)
+    def _enumerate(self, node: ast.Call, value: Value, start: Value = 0) -> Value:
+        found, first = self.series(value, node), self.code(start, self.kind(start, node))
 
-        def item(index: str) -> Value:
-            return ItemList((Number("int", f"({first.code} + {index})"), found.item(index)))
+        def item(index: Value) -> Value:
+            return Number("int", f"({first} + {self.code(index, 'int')})"), found.item(index)
 
-        return Thing("iterated", "an enumeration", node, Iterated(found.length, item, found.known))
+        return Series("an enumeration", found.length, item)
 
     def _zip(self, node: ast.Call, *values: Value) -> Value:
-        found = [self.iterated(each, node) for each in values]
+        found = [self.series(each, node) for each in values]
         if not found:
             raise Outside(node, "zip() of nothing")
-        known = [each.known for each in found]
-        least = min(each for each in known if each is not None) if None not in known else None
-        length = found[0].length
-        for each in found[1:]:
-            name = self.fresh()
-            self.emit(f"const long long {name} = {each.length} < {length} ? {each.length} : {length};")
-            length = name
-        scope = Iterated(length, lambda index: ItemList(tuple(each.item(index) for each in found)), least)
-        return Thing("iterated", "a zip", node, scope)
+        length = self._extreme("min", node, [each.length for each in found])
+        return Series("a zip", length, lambda index: tuple(each.item(index) for each in found))
 
     def _reversed(self, node: ast.Call, value: Value) -> Value:
-        found = self.iterated(value, node)
-        name = self.fresh()
-        self.emit(f"const long long {name} = {found.length};")
-        scope = Iterated(name, lambda index: found.item(f"({name} - 1 - {index})"), found.known)
-        return Thing("iterated", "a reversed list", node, scope)
+        found = self.series(value, node)
+        last = self.code(self.hold(found.length), "int")
+        return Series(
+            "a reversed list",
+            found.length,
+            lambda index: found.item(Number("int", f"({last} - 1 - {self.code(index, 'int')})")),
+        )
 
-    def _min(self, node: ast.Call, *values: Value) -> Value:
-        return self._extreme("min", node, *values)
-
-    def _max(self, node: ast.Call, *values: Value) -> Value:
-        return self._extreme("max", node, *values)
-
-    def _extreme(self, name: str, node: ast.Call, *values: Value) -> Value:
-        items: tuple[Value, ...] = values
-        if len(values) == 1:
-            if not isinstance(values[0], ItemList):
-                return self._fold(name, node, lambda use: self.each(values[0], node, use))
-            items = values[0].items
+    def _extreme(self, name: str, node: ast.AST, items: Sequence[Value]) -> Value:
+        """The least or greatest of a few numbers."""
         if not items:
             raise Outside(node, f"{name}() of nothing")
-        sign, best = "<" if name == "min" else ">", self.numeric(items[0], node)
+        best = items[0]
         for item in items[1:]:
-            other = self.numeric(item, node)
-            kind = joined(best.kind, other.kind)
-            one, two = (self.numeric(self.hold(Number(kind, cast(each, kind))), node) for each in (best, other))
-            best = Number(kind, f"({two.code} {sign} {one.code} ? {two.code} : {one.code})")
+            kind = joined(Number(self.kind(best, node)), Number(self.kind(item, node))).kind
+            one, other = (self.code(self.hold(Number(kind, self.code(each, kind))), kind) for each in (best, item))
+            best = Number(kind, f"({other} {'<' if name == 'min' else '>'} {one} ? {other} : {one})")
+        self.kind(best, node)
         return best
 
-    def _sum(self, node: ast.Call, value: Value, start: Value | None = None) -> Value:
-        return self._fold("sum", node, lambda use: self.each(value, node, use), start)
 
-    def _any(self, node: ast.Call, value: Value) -> Value:
-        return self._fold("any", node, lambda use: self.each(value, node, use))
-
-    def _all(self, node: ast.Call, value: Value) -> Value:
-        return self._fold("all", node, lambda use: self.each(value, node, use))
-
-    # what is worked out over many items
-
-    def _folded(self, name: str, node: ast.Call, items: _Comprehension) -> Value:
-        options = {each.arg: each.value for each in node.keywords}
-        if name in ("min", "max") and "key" in options:
-            return self._best(name, node)
-        starts = [*node.args[1:], *options.values()]
-        is_refused = (name == "len" and isinstance(items, ast.GeneratorExp)) or (name != "sum" and len(node.args) > 1)
-        if is_refused or len(starts) > 1 or set(options) - {_FOLDS[name]}:
-            raise Outside(node, f"{name}() in this form")
-        start = self.expression(starts[0]) if starts else None
-        return self._fold(name, node, lambda use: self.over(items, use), start)
-
-    def over(self, node: _Comprehension, use: Callable[[Value], None], place: int = 0) -> None:
-        """Go through the items of a comprehension; ``use`` adds the lines for one."""
-        if place == len(node.generators):
-            use(self.expression(node.elt))
-            return
-        generator = node.generators[place]
-
-        def one(item: Value) -> None:
-            held = self.hold(item)
-            self.overlay.append({})
-            self.unpack(generator.target, held, self._keep)
-            for test in generator.ifs:
-                self.emit(f"if (!{self.condition(test).code}) continue;")
-            self.over(node, use, place + 1)
-            self.overlay.pop()
-
-        self.each(self.expression(generator.iter), node, one)
-
-    def _keep(self, name: str, value: Value, node: ast.AST) -> None:
-        """Give a variable of the innermost comprehension its value."""
-        self.overlay[-1][name] = value
-
-    def unpack(self, target: ast.expr, value: Value, store: Callable[[str, Value, ast.AST], None]) -> None:
-        """Give the names of a target their values."""
-        if isinstance(target, ast.Name):
-            store(target.id, value, target)
-        elif isinstance(target, ast.Tuple | ast.List):
-            if isinstance(value, Constant) and isinstance(value.value, list | tuple):
-                value = ItemList(tuple(self.program.wrap(each, target) for each in value.value))
-            if not isinstance(value, ItemList) or len(value.items) != len(target.elts):
-                raise Outside(target, f"{len(target.elts)} names for {described(shape_of(value))}")
-            for each, item in zip(target.elts, value.items, strict=True):
-                self.unpack(each, item, store)
-        else:
-            raise Outside(target, "a list whose items are changed" if isinstance(target, ast.Subscript) else "a target")
-
-    def _fold(
-        self, name: str, node: ast.AST, loop: Callable[[Callable[[Value], None]], None], start: Value | None = None
-    ) -> Value:
-        """``sum``, ``min``, ``max``, ``any``, ``all`` or ``len`` of what a loop goes through."""
-        result, seen = self.fresh(), self.fresh()
-        kinds: list[str] = []
-
-        def look(item: Value) -> None:
-            if name in ("sum", "min", "max"):
-                kinds.append(self.numeric(item, node).kind)
-
-        self.captured(lambda: loop(look))  # tells the type
-        kind = {"any": "bool", "all": "bool", "len": "int"}.get(name) or (kinds[0] if kinds else "int")
-        first = number({"all": True, "any": False}.get(name, 0)) if start is None else self.numeric(start, node)
-        if name == "sum":
-            kind = joined("int" if kind == "bool" else kind, first.kind if first.kind != "bool" else "int")
-        elif start is not None:
-            kind = joined(kind, first.kind)
-        self.emit(f"{C_TYPES[kind]} {result} = {cast(first, kind)}; bool {seen} = false;")
-
-        def use(item: Value) -> None:
-            if name in ("any", "all"):
-                sign = "" if name == "any" else "!"
-                decided = "true" if name == "any" else "false"
-                self.emit(f"if {parenthesised(sign + self.truth(item, node).code)} {{ {result} = {decided}; break; }}")
-            elif name == "len":
-                self.emit(f"{result} += 1;")
-            elif name == "sum":
-                added = self.binary(ast.Add(), Number(kind, result), item, node)
-                self.emit(f"{result} = {cast(self.numeric(added, node), kind)};")
-            else:
-                held = cast(self.numeric(self.hold(self.numeric(item, node)), node), kind)
-                self.emit(f"if (!{seen} || {held} {'<' if name == 'min' else '>'} {result}) {result} = {held};")
-                self.emit(f"{seen} = true;")
-
-        loop(use)
-        if name in ("min", "max") and start is None:
-            self.emit(f"if (!{seen}) py_fail({self.at(node)} + {EMPTY});")
-        return Number(kind, result)
-
-    def _best(self, name: str, node: ast.Call) -> Value:
-        """``min`` or ``max`` with ``key=``: the first item of the least or greatest key."""
-        options = {each.arg: each.value for each in node.keywords}
-        if len(node.args) != 1 or set(options) - {"key", "default"}:
-            raise Outside(node, f"{name}() in this form")
-        source = node.args[0]
-        if isinstance(source, _Comprehension):
-            values: Value | None = None
-        else:
-            values = self.expression(source)
-
-        def loop(use: Callable[[Value], None]) -> None:
-            if values is None:
-                assert isinstance(source, _Comprehension)
-                self.over(source, use)
-            else:
-                self.each(values, node, use)
-
-        if "key" not in options:
-            return self._fold(name, node, loop, self.expression(options["default"]))
-        if "default" in options:
-            raise Outside(node, f"{name}() with key= and default=")
-        key = (
-            self.expression(options["key"])
-            if not isinstance(options["key"], ast.Lambda)
-            else self._Lambda(options["key"])
-        )
-        shapes: list[Any] = []
-
-        def keyed(item: Value) -> Number:
-            if isinstance(key, Thing) and key.kind == "function":
-                return self.numeric(self.apply(key, [item], {}, node), node)
-            raise Outside(node, f"{name}() with a key that is no function of the file")
-
-        def look(item: Value) -> None:
-            shapes.append((shape_of(item), keyed(self.hold(item)).kind))
-
-        self.captured(lambda: loop(look))
-        shape, kind = shapes[0]
-        names, best, seen = [self.fresh() for _ in flat(shape)], self.fresh(), self.fresh()
-        for each, letter in zip(names, flat(shape), strict=True):
-            self.emit(f"{C_TYPES[letter]} {each} = 0;")
-        self.emit(f"{C_TYPES[kind]} {best} = 0; bool {seen} = false;")
-
-        def use(item: Value) -> None:
-            held = self.hold(item)
-            found = cast(self.numeric(self.hold(keyed(held)), node), kind)
-            kept = " ".join(f"{each} = {code};" for each, code in zip(names, codes(held, shape), strict=True))
-            sign = "<" if name == "min" else ">"
-            self.emit(f"if (!{seen} || {found} {sign} {best}) {{ {best} = {found}; {seen} = true; {kept} }}")
-
-        loop(use)
-        self.emit(f"if (!{seen}) py_fail({self.at(node)} + {EMPTY});")
-        return rebuilt(shape, list(names))
-
-    def _Lambda(self, node: ast.Lambda) -> Value:
-        return Thing("function", "lambda", node, self)
-
-    def _ListComp(self, node: ast.ListComp) -> Value:
-        """A list of known length, item by item."""
-        generator = node.generators[0]
-        if len(node.generators) > 1 or generator.ifs:
-            raise Outside(node, "a list that grows")
-        found = self.iterated(self.expression(generator.iter), node)
-        if found.known is None or found.known > LONGEST_GROUP:
-            raise Outside(node, "a list that grows")
-        items = []
-        for index in range(found.known):
-            self.overlay.append({})
-            self.unpack(generator.target, self.hold(found.item(str(index))), self._keep)
-            items.append(self.hold(self.expression(node.elt)))
-            self.overlay.pop()
-        return ItemList(tuple(items))
+def _of_known(name: str, arguments: Sequence[Value]) -> Value:
+    """Python's own result of a function of known values; ``...``: they are not known, or it has none."""
+    module, _, function = name.rpartition(".")
+    if not is_known(arguments) or not (name in _OF_KNOWN or module == "math"):
+        return ...
+    try:
+        value = getattr(math if module else builtins, function)(*arguments)
+    except (ValueError, TypeError, ArithmeticError, AttributeError):
+        return ...  # the error is reported where the function runs
+    return value if is_known(value) and fits(value) else ...

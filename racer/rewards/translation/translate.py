@@ -5,12 +5,10 @@ from __future__ import annotations
 import ast
 from dataclasses import dataclass
 
-from racer.rewards.parameters import TRACK
 from racer.rewards.problems import LARGEST_REWARD, out_of_range
-from racer.rewards.translation.body import Body
-from racer.rewards.translation.expression_values import C_TYPES, Outside, Thing, described
-from racer.rewards.translation.prelude import BEYOND, ERRORS, MOST_ROUNDS, NOT_FINITE, used
-from racer.rewards.translation.program import Program
+from racer.rewards.translation.body import Module
+from racer.rewards.translation.prelude import BEYOND, ERRORS, NOT_FINITE, prelude
+from racer.rewards.translation.values import PARAMS, Function, Outside, described, kind_of
 
 
 @dataclass(frozen=True)
@@ -42,46 +40,25 @@ def translate(source: str) -> Translated:
 
 
 def _translate(tree: ast.Module) -> Translated:
-    program = Program(tree)
-    main = program.names.get("reward_function")
-    if not isinstance(main, Thing) or main.kind != "function":
-        raise Outside(getattr(main, "node", None) or 1, "a reward_function that is no plain function")
-    call = ast.parse("lambda params: reward_function(params)", mode="eval").body
-    assert isinstance(call, ast.Lambda)
-    ast.increment_lineno(call, main.node.lineno - 1)
-    body = Body(program, call, {"params": Thing("params", "params")}, None)
-    if body.result not in ("int", "float"):
-        found = "nothing" if body.result is None else described(body.result)
-        raise Outside(main.node, f"a reward_function that returns {found}")
-    text = "\n".join([*program.functions, *body.text])
-    structs = [
-        f"struct {name} {{ {' '.join(f'{C_TYPES[kind]} a{place};' for place, kind in enumerate(kinds))} }};"
-        for kinds, name in program.structs.items()
-    ]
-    reads_track = "waypoint" in text  # py_waypoint, count_waypoints
-    track = [
-        f"const int track = (int)wp::index(race.numbers, world, {TRACK});",
-        "const long long count_waypoints = (long long)wp::index(race.counts, track);",
-    ]
+    module = Module(tree)
+    main = module.names.get("reward_function")
+    if not isinstance(main, Function):
+        raise Outside(getattr(main, "line", 1), "a reward_function that is no plain function")
+    reward = module.apply(main, [PARAMS], {}, main.node)
+    if kind_of(reward) not in ("int", "float"):
+        raise Outside(main.node, f"a reward_function that returns {described(reward)}")
     lines = [
-        "int error = 0;",
-        f"int rounds = {MOST_ROUNDS};",
-        *(track if reads_track else []),
-        *program.prologue(),
-        *structs,
-        *(declaration for _, declaration in program.tables.values()),
-        *used(text),
-        *program.functions,
-        f"auto reward_function = [&]() -> {body.returns} {{",
-        *body.text,
-        "};",
-        "const double reward = (double)reward_function();",
+        prelude(),
+        *(text.format(name) for text, name in module.tables.items()),
+        *module.functions,
+        *module.lines,
+        f"const double reward = (double){reward.code};",
         f"if (!py_finite(reward)) py_fail({NOT_FINITE});",
         f"if (::fabs(reward) > {LARGEST_REWARD!r}) {{ py_fail({BEYOND}); wp::index(race.values, world) = (float)reward; }}",
         "if (error) { wp::index(race.errors, world, 0) = error; wp::index(race.errors, world, 1) += 1; return (float)NAN; }",
         "return (float)reward;",
     ]
-    return Translated("\n".join(lines) + "\n", tuple(program.notes))
+    return Translated("\n".join(lines) + "\n", tuple(module.notes))
 
 
 def failure_message(code: int, value: float) -> str:

@@ -69,8 +69,8 @@ def test_a_race_is_a_job_of_its_own_kind_with_the_rules_that_were_given(full: Se
 
 def test_copying_step_logs_replaces_no_file(full: Serving, tmp_path: Path) -> None:
     (tmp_path / "sim-trace").mkdir()
-    said = refusal(full, "evaluate", "fast-car", "--race", "-o", str(tmp_path))
-    assert "sim-trace exists; name another directory" in said
+    output = refusal(full, "evaluate", "fast-car", "--race", "-o", str(tmp_path))
+    assert "sim-trace exists; name another directory" in output
 
 
 @pytest.mark.parametrize(
@@ -91,12 +91,12 @@ def test_a_training_on_an_unknown_track_is_told_the_nearest_name(full: Serving, 
 def test_what_learns_numbers_alone_takes_no_choices(full: Serving, algorithm: str) -> None:
     changes = (f"train.config.action_space={CHOICES}", f"train.algorithm={algorithm}", "train.ppo={}")
     for dry in ((), ("--dry-run",)):
-        told = refusal(full, "submit", "job_specs/racer.yaml", *(f"--set={each}" for each in changes), *dry)
-        assert f"train.{algorithm}: " in told and "choices; use ppo" in told
+        message = refusal(full, "submit", "job_specs/racer.yaml", *(f"--set={each}" for each in changes), *dry)
+        assert f"train.{algorithm}: " in message and "choices; use ppo" in message
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "output"),
     [
         (f"action_space={CHOICES}", "ranges of 2 actions, and the clone would have 3 actions to choose from"),
         ("waypoints=5", "8, and the clone would have 5"),
@@ -104,10 +104,12 @@ def test_what_learns_numbers_alone_takes_no_choices(full: Serving, algorithm: st
         ("lidar={sectors: 4}", "none, and the clone would have one of 4 numbers"),
     ],
 )
-def test_a_clone_whose_network_would_have_another_size_is_refused(full: Serving, change: str, said: str) -> None:
+def test_a_clone_whose_network_would_have_another_size_is_refused(full: Serving, change: str, output: str) -> None:
     for dry in ((), ("--dry-run",)):
-        told = refusal(full, "clone", "racer", "--name", "other", "--set", f"train.config.{change}", *dry)
-        assert f"train.config.{change.partition('=')[0]}: {said}" in told and "leave the setting as it is" in told
+        message = refusal(full, "clone", "racer", "--name", "other", "--set", f"train.config.{change}", *dry)
+        assert (
+            f"train.config.{change.partition('=')[0]}: {output}" in message and "leave the setting as it is" in message
+        )
 
 
 def test_a_clone_on_another_track_can_be_tried_without_one(full: Serving) -> None:

@@ -80,8 +80,8 @@ class Paddock:
 
     def races(self) -> list[dict[str, Any]]:
         """The jobs of races."""
-        wanted = [{"name": "JOB_NAME", "values": ["race-*"]}]
-        listed = self.server.client.batch("ListJobs", jobQueue="default", filters=wanted)
+        expected = [{"name": "JOB_NAME", "values": ["race-*"]}]
+        listed = self.server.client.batch("ListJobs", jobQueue="default", filters=expected)
         found: list[dict[str, Any]] = listed["jobSummaryList"]
         return found
 
@@ -99,17 +99,17 @@ def paddock(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Paddock]:
 
 def test_a_league_is_created_once_listed_and_shown(paddock: Paddock) -> None:
     options = ("--track", "oval", "--track", "random:7", "--laps", "4", "--ranking", "best", "--continuous")
-    told = paddock.done("create", "grand", *options, "--off-track-penalty", "2", "--closes", "2999-01-01T00:00Z")
-    assert "grand: 4 laps on oval, random:7; open until 2999-01-01 00:00:00 UTC" in told
-    assert "put back at most 100 times in a lap; 2 s off the track, 1 s for a crash" in told
+    message = paddock.done("create", "grand", *options, "--off-track-penalty", "2", "--closes", "2999-01-01T00:00Z")
+    assert "grand: 4 laps on oval, random:7; open until 2999-01-01 00:00:00 UTC" in message
+    assert "put back at most 100 times in a lap; 2 s off the track, 1 s for a crash" in message
     league = leagues.find(paddock.store, "grand").definition()
     assert (league.track, league.rules.laps, league.rules.off_track_penalty) == (("oval", "random:7"), 4, 2.0)
     assert league.closes == 32_472_144_000.0 and league.owner.startswith("user ")
-    said = paddock.refused("create", "grand", "--track", "oval")
-    assert "grand exists already, and a league is never changed" in said
+    output = paddock.refused("create", "grand", "--track", "oval")
+    assert "grand exists already, and a league is never changed" in output
     (row,) = [each for each in paddock.done("list").splitlines() if each.startswith("grand ")]
     assert row.split()[:6] == ["grand", "oval,", "random:7", "4", "best", "0"]
-    assert paddock.done("show", "grand") == told
+    assert paddock.done("show", "grand") == message
     assert paddock.done("table", "grand") == "grand has no entries yet; muster league submit grand MODEL\n"
 
 
@@ -160,9 +160,9 @@ def test_wrong_use_is_one_line_and_starts_nothing(cups: Paddock, line: str) -> N
 
 def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     cups.done("create", "long", "--track", "oval", "--laps", "5", "--continuous", "--seed", "11", "--seconds", "60")
-    told = cups.done("submit", "long", "fast@2", "--as", "ada", "--detach")
+    message = cups.done("submit", "long", "fast@2", "--as", "ada", "--detach")
     job = json.loads(cups.server.muster("list", "--json").stdout)[0]["jobId"]
-    assert told.splitlines() == [
+    assert message.splitlines() == [
         f"submitted the race of fast@2 as {job}",
         f"enter it after it has ended: muster league submit long fast@2 --as 'ada' --evaluation {job[:8]}",
     ]
@@ -172,8 +172,8 @@ def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     assert (section["run"], section["checkpoint"], section["trials"], section["seed"]) == ("racer", 12, 5, 11)
     assert (section["track"], section["continuous"], section["seconds"]) == (["oval"], True, 60.0)
     assert section["config"] == leagues.CAR
-    said = cups.refused("submit", "long", "fast@2", "--evaluation", job)
-    assert "is RUNNABLE: only a race that has SUCCEEDED" in said
+    output = cups.refused("submit", "long", "fast@2", "--evaluation", job)
+    assert "is RUNNABLE: only a race that has SUCCEEDED" in output
     cups.server.client.batch("TerminateJob", jobId=job, reason="seen")
 
 
@@ -197,8 +197,8 @@ def test_an_idempotency_key_answers_the_same_race_alone(cups: Paddock) -> None:
 def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_path: Path) -> None:
     cups.done("create", "spring", "--track", "oval")
     slow, fast = cups.raced(0, race([14.0, 14.0, 14.5])), cups.raced(1, race([12.0, 12.5, 12.25], off_tracks=1), 2)
-    told = cups.done("submit", "spring", "fast@1", "--as", "ada", "--evaluation", slow)
-    assert told == "entry 1 of spring: ada with fast@1, 0:42.500, rank 1\n"
+    message = cups.done("submit", "spring", "fast@1", "--as", "ada", "--evaluation", slow)
+    assert message == "entry 1 of spring: ada with fast@1, 0:42.500, rank 1\n"
     row = json.loads(cups.done("submit", "spring", "fast@2", "--as", "Bob B.", "--evaluation", fast[:8], "--json"))
     assert (row["rank"], row["entry"], row["time"], row["off_tracks"]) == (1, 2, 36.75, 1)
     again = cups.refused("submit", "spring", "fast@2", "--as", "Bob B.", "--evaluation", fast)
@@ -212,8 +212,8 @@ def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_pa
     with table.open() as file:
         first, second = csv.DictReader(file)
     assert (first["racer"], first["time"], second["rank"], second["model"]) == ("Bob B.", "36.75", "2", "fast@1")
-    told = cups.done("disqualify", "spring", "2", "--reason", "not a car")
-    assert told == "entry 2 of spring is disqualified: not a car\n"
+    message = cups.done("disqualify", "spring", "2", "--reason", "not a car")
+    assert message == "entry 2 of spring is disqualified: not a car\n"
     assert "entry 2 is disqualified already" in cups.refused("disqualify", "spring", "2", "--reason", "no")
     rows = [(each["rank"], each["entry"], each["status"]) for each in cups.rows("spring")]
     assert rows == [(1, 1, "ranked"), (None, 2, "disqualified")]
@@ -226,16 +226,16 @@ def test_races_are_entered_ranked_written_and_disqualified(cups: Paddock, tmp_pa
 def test_an_evaluation_that_is_not_of_the_league_s_race_is_not_entered(cups: Paddock) -> None:
     cups.done("create", "strict", "--track", "oval")
     job = cups.raced(2, race([12.0, 12.0, 12.0]))
-    said = cups.refused("submit", "strict", "fast@2", "--evaluation", job)
-    assert "it is of checkpoint 00000011-e1, the model of 00000012-e1" in said
-    for driven, changes, said in (
+    output = cups.refused("submit", "strict", "fast@2", "--evaluation", job)
+    assert "it is of checkpoint 00000011-e1, the model of 00000012-e1" in output
+    for driven, changes, output in (
         (race([12.0] * 3), {"seed": 5}, "its seed is 5, the league's 1"),
         ({**race([12.0] * 3), "trials": [{}] * 3}, {}, "race.trials.0: expected trial 1 with its status"),
     ):
         job = cups.raced(2, driven, **changes)
-        assert said in cups.refused("submit", "strict", "fast@1", "--evaluation", job)
-    said = cups.refused("submit", "strict", "fast@1", "--evaluation", cups.jobs[5])
-    assert "has left no evaluation of run racer" in said and cups.rows("strict") == []
+        assert output in cups.refused("submit", "strict", "fast@1", "--evaluation", job)
+    output = cups.refused("submit", "strict", "fast@1", "--evaluation", cups.jobs[5])
+    assert "has left no evaluation of run racer" in output and cups.rows("strict") == []
 
 
 def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_closed(cups: Paddock) -> None:
@@ -244,8 +244,8 @@ def test_a_race_that_was_submitted_in_time_is_entered_after_the_league_has_close
     assert "league ended closed at" in cups.refused("submit", "ended", "fast@1")
     assert "rank 1" in cups.done("submit", "ended", "fast@1", "--evaluation", job)
     leagues.create(cups.store, league("missed", seed=1, closes=cups.ended - 3600))
-    said = cups.refused("submit", "missed", "fast@1", "--evaluation", job)
-    assert f"and job test ({job[:8]}) was not submitted in between" in said
+    output = cups.refused("submit", "missed", "fast@1", "--evaluation", job)
+    assert f"and job test ({job[:8]}) was not submitted in between" in output
 
 
 def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
@@ -260,9 +260,9 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     assert [(row["rank"], row["entry"], row["status"]) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
 
     def verified(*more: str) -> str:
-        told = cups.muster("verify", "honest", *more)
-        assert told.returncode == 1
-        return told.stdout
+        message = cups.muster("verify", "honest", *more)
+        assert message.returncode == 1
+        return message.stdout
 
     altered = "entry 1: the content of entry.json was altered (SHA-256 differs)\n"
     assert verified() == f"{altered}entry 2: the entry and its model are unchanged\n"
@@ -276,8 +276,8 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     onnx = models.find(cups.store, "fast", 2).bundle / "policy.onnx"
     onnx.chmod(0o644)
     onnx.write_bytes(b"Weights")
-    said = "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n"
-    assert said in verified("2", "--rerun")
+    output = "entry 2: model fast@2: the content of bundle/policy.onnx was altered (SHA-256 differs)\n"
+    assert output in verified("2", "--rerun")
     before = cups.races()
     assert "model fast@2: the content of bundle/policy.onnx was altered" in cups.refused("submit", "honest", "fast@2")
     onnx.write_bytes(b"weights")
@@ -286,20 +286,20 @@ def test_altered_entries_are_reported_and_not_ranked(cups: Paddock) -> None:
     assert "the content of learner.pt was altered" in cups.refused("submit", "honest", "fast@2")
     weights.write_bytes(b"weights")
     os.rename(weights.parent, weights.parent.with_name("away"))
-    said = "checkpoint 00000012-e1 of run racer, which a race loads, is gone; register one that is there"
-    assert said in cups.refused("submit", "honest", "fast@2")
-    assert f"entry 2: model fast@2: {said}" in verified("2", "--rerun")
+    output = "checkpoint 00000012-e1 of run racer, which a race loads, is gone; register one that is there"
+    assert output in cups.refused("submit", "honest", "fast@2")
+    assert f"entry 2: model fast@2: {output}" in verified("2", "--rerun")
     os.rename(weights.parent.with_name("away"), weights.parent)
     assert cups.races() == before, "nothing was started"
 
     rules = leagues.find(cups.store, "honest").path / "definition" / "league.json"
     rules.chmod(0o644)
     rules.write_bytes(rules.read_bytes().replace(b'"seed": 1', b'"seed": 2'))
-    said = "league honest: the content of league.json was altered"
-    for ask in (("table", "honest"), ("show", "honest"), ("submit", "honest", "fast@1")):
-        assert said in cups.refused(*ask)
-    (told,) = [each for each in json.loads(cups.done("list", "--json")) if each["name"] == "honest"]
-    assert said in told["problem"] and said in cups.done("list")
+    output = "league honest: the content of league.json was altered"
+    for send in (("table", "honest"), ("show", "honest"), ("submit", "honest", "fast@1")):
+        assert output in cups.refused(*send)
+    (message,) = [each for each in json.loads(cups.done("list", "--json")) if each["name"] == "honest"]
+    assert output in message["problem"] and output in cups.done("list")
 
 
 # -- tracks ------------------------------------------------------------------------------------------------------------
@@ -338,8 +338,8 @@ def test_tracks_are_made_imported_drawn_and_listed(shared_server: Serving, tmp_p
     assert swapped.returncode == 0 and "mended:     the borders were swapped" in swapped.stdout, swapped.stderr
     rows[9] = np.nan
     np.save(tmp_path / "broken.npy", rows)
-    said = refused("import", str(tmp_path / "broken.npy"), "--name", "broken")
-    assert f"{tmp_path}/broken.npy: centre line: row 9" in said
+    output = refused("import", str(tmp_path / "broken.npy"), "--name", "broken")
+    assert f"{tmp_path}/broken.npy: centre line: row 9" in output
 
     (store.path / "tracks" / "copy" / "manifest.json").unlink()
     listed = json.loads(call_muster("tracks", "list", "--json", home=home).stdout)

@@ -77,7 +77,7 @@ def test_a_form_makes_a_track_for_good(console: Console, visitor: Visitor) -> No
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         ({"length": "2"}, "length 2 m: expected 4 to 1000 m"),
         ({"length": "long"}, "length: expected a number, found a text ('long')"),
@@ -90,8 +90,10 @@ def test_a_form_makes_a_track_for_good(console: Console, visitor: Visitor) -> No
         ({"name": "oval"}, "a preset is called so; choose another name"),
     ],
 )
-def test_a_track_that_can_t_be_made_is_refused_by_its_field(console: Console, wrong: dict[str, str], told: str) -> None:
-    assert told in console.visitor().refusal("/tracks", **{"name": "wrong", "seed": "7", **wrong}, status=400)
+def test_a_track_that_can_t_be_made_is_refused_by_its_field(
+    console: Console, wrong: dict[str, str], message: str
+) -> None:
+    assert message in console.visitor().refusal("/tracks", **{"name": "wrong", "seed": "7", **wrong}, status=400)
     assert "wrong" not in [each["name"] for each in console.client.get("/api/tracks")]
 
 
@@ -191,8 +193,8 @@ def test_a_model_is_raced_and_its_race_entered_once_it_has_ended(console: Consol
 def test_what_has_succeeded_is_entered_for_good(console: Console, visitor: Visitor, store: Store) -> None:
     registered = console.register("driven", "0.1")
     tags = {"muster:league": "cup", "muster:model": "fast@2"}
-    given = {"jobName": "race-cup-fast-2", "jobQueue": "default", "jobDefinition": registered, "tags": tags}
-    job = str(console.client.batch("SubmitJob", **given)["jobId"])
+    fields = {"jobName": "race-cup-fast-2", "jobQueue": "default", "jobDefinition": registered, "tags": tags}
+    job = str(console.client.batch("SubmitJob", **fields)["jobId"])
     await_status(console.client, job, "SUCCEEDED")
     path = store.run("second").evaluations / f"{evaluation_name('00000007-e1', job)}.json"
     write_json(path, summary(race([11.0, 11.5, 12.0]), job=job))
@@ -210,8 +212,8 @@ def test_an_entry_is_disqualified_once_the_person_has_said_yes(console: Console,
     visitor = console.visitor()
     path = "/leagues/cup/entries/2/disqualify"
     assert "reason" in visitor.submit(path, reason=" ").json()["message"]
-    asked = visitor.submit(path, reason=HOSTILE)
-    assert asked.status_code == 409 and asked.json()["question"]["title"] == "Disqualify entry 2 of cup?"
+    request = visitor.submit(path, reason=HOSTILE)
+    assert request.status_code == 409 and request.json()["question"]["title"] == "Disqualify entry 2 of cup?"
     page = visitor.http.post(path, data={"form_token": visitor.page("/").form_token, "reason": HOSTILE})
     assert page.status_code == 409 and Page(page.text).is_inert and HOSTILE in Page(page.text).text
     for other in ("lab", "reader"):

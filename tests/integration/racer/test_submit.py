@@ -22,9 +22,9 @@ def test_a_reward_function_is_checked_as_it_is_typed_and_tried_when_its_editor_i
     visitor, name = console.visitor(), "train.config.reward_function"
     fields = filled(visitor, "Racer", **{"train__config__track": ["oval", "", "random:7"]})
     fields["train.hyperparameters.lr"] = "1e-4"
-    told = checked(visitor, {**fields, name: REWARD})
-    job, lines = strict_yaml.load(told["yaml"])
-    assert told["problem"] is None and job["train"]["config"]["track"] == ["oval", "random:7"]
+    message = checked(visitor, {**fields, name: REWARD})
+    job, lines = strict_yaml.load(message["yaml"])
+    assert message["problem"] is None and job["train"]["config"]["track"] == ["oval", "random:7"]
     assert job["train"]["config"]["reward_function"]["text"] == REWARD.replace("\r\n", "\n")
     forbidden = checked(visitor, {**fields, name: "import os\n" + REWARD})
     assert (forbidden["problem"]["key"], forbidden["problem"]["code_line"]) == (name, 1)

@@ -45,15 +45,15 @@ def test_a_race_has_the_same_lap_times_again_and_its_step_logs_are_copied(
     first = json.loads(done(server, *options, "-o", str(tmp_path / "logs")))
     second = json.loads(done(server, *options))
     assert first["race"] == second["race"] and first["name"] != second["name"]
-    told = first["race"]
-    assert told["rules"] == {
+    message = first["race"]
+    assert message["rules"] == {
         **{"laps": 2, "continuous": True, "off_track_penalty": 5.0, "crash_penalty": 5.0, "max_resets": 100},
         **{"seconds": 30.0, "ranking": None},
     }
-    assert told["track"] == ["chicane"] and [trial["trial"] for trial in told["trials"]] == [1, 2]
+    assert message["track"] == ["chicane"] and [trial["trial"] for trial in message["trials"]] == [1, 2]
     logs = sorted((tmp_path / "logs").rglob("*.csv"))
     assert [log.name for log in logs] == ["0-iteration.csv", "1-iteration.csv"]
-    for log, trial in zip(logs, told["trials"], strict=True):
+    for log, trial in zip(logs, message["trials"], strict=True):
         rows = log.read_text().splitlines()
         assert len(rows) == 2 + trial["steps"]  # columns, the start, a row a step
         assert trial["time"] == trial["steps"] / 15 + 5.0 * trial["off_tracks"]
@@ -66,8 +66,8 @@ def test_a_race_is_printed_as_a_table_and_does_not_choose_the_best_checkpoint(se
         return [(each["name"], each["best"], each["evaluated"]) for each in listed]
 
     before = chosen()
-    told = done(server, "evaluate", f"{run}@15", "--race", "--trials", "1", "--set", "race.seconds=2")
-    assert "TRIAL       TIME COMPLETED STATUS" in told and "checkpoint 00000015-e1" in told
+    message = done(server, "evaluate", f"{run}@15", "--race", "--trials", "1", "--set", "race.seconds=2")
+    assert "TRIAL       TIME COMPLETED STATUS" in message and "checkpoint 00000015-e1" in message
     assert chosen() == before
 
 
@@ -77,9 +77,9 @@ def test_a_racer_is_registered_raced_ranked_and_verified(server: Serving, run: s
         done(server, "models", "register", run, "--name", "fast", "--again")
 
     done(server, "league", "create", "cup", "--track", "oval", "--laps", "2", "--continuous")
-    told = done(server, "league", "submit", "cup", "fast@1", "--as", "ada")
-    assert "race: 2 laps of Racer on oval" in told
-    assert told.splitlines()[-1].startswith("entry 1 of cup: ada with fast@1")
+    message = done(server, "league", "submit", "cup", "fast@1", "--as", "ada")
+    assert "race: 2 laps of Racer on oval" in message
+    assert message.splitlines()[-1].startswith("entry 1 of cup: ada with fast@1")
     later = json.loads(done(server, "league", "submit", "cup", "fast", "--as", "bob", "--json"))
     assert (later["entry"], later["model"], later["laps"]) == (2, "fast@2", 2)
     rows = json.loads(done(server, "league", "table", "cup", "--json"))

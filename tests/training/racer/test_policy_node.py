@@ -41,5 +41,5 @@ def test_the_node_drives_a_car_whose_policy_chooses_among_actions(tmp_path: Path
         chosen = node.act({"obs": images.numpy()})
         np.testing.assert_array_equal(chosen, policy.act(TensorDict(dict(task.groups), batch_size=[4])).numpy())
         task.step(torch.from_numpy(chosen))
-        asked = [commands.command(each).values for each in chosen]
-        np.testing.assert_allclose(asked, task.sensors["car"].arrays.commands.numpy(), rtol=1e-6)
+        request = [commands.command(each).values for each in chosen]
+        np.testing.assert_allclose(request, task.sensors["car"].arrays.commands.numpy(), rtol=1e-6)

@@ -105,10 +105,12 @@ def test_the_state_of_a_function_is_its_cars_alone(kind: str, tmp_path: Path, ca
     lines = [line[:count].tolist() for line, count in zip(race.waypoints.numpy(), race.counts.numpy(), strict=True)]
     cars = [[(n[car].tolist(), list[Any](), int(n[car, TRACK])) for n, _, _ in calls] for car in range(WORLDS)]
     assert len(calls) >= 32 and len({line for car in cars for _, _, line in car}) == 2
-    asked = json.dumps({"source": FUNCTIONS[kind], "cars": cars, "lines": lines})
-    said = subprocess.run([sys.executable, "-c", ALONE], input=asked, capture_output=True, text=True, cwd=REPOSITORY)
-    assert said.returncode == 0, said.stderr
-    expected = np.array([json.loads(line) for line in said.stdout.splitlines()], np.float32)
+    request = json.dumps({"source": FUNCTIONS[kind], "cars": cars, "lines": lines})
+    answer = subprocess.run(
+        [sys.executable, "-c", ALONE], input=request, capture_output=True, text=True, cwd=REPOSITORY
+    )
+    assert answer.returncode == 0, answer.stderr
+    expected = np.array([json.loads(line) for line in answer.stdout.splitlines()], np.float32)
     found = np.stack([rewards for _, _, rewards in calls], axis=1)
     np.testing.assert_array_equal(found, expected)
     assert len({tuple(row) for row in found.tolist()}) > 1, "the cars are alike: the test shows nothing"
@@ -173,5 +175,5 @@ def test_a_function_that_fails_in_too_many_worlds_ends_the_job_which_is_not_trie
         UserError, match=r"its reward term reward was not finite: reward\.py.*; that is more than nan_limit"
     ):
         trained(f"{before}def reward_function(params):\n    return {fault}\n", tmp_path, nan_limit=0.0)
-    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: reward.py")]
-    assert len(told) == 1 and ("ZeroDivisionError" in told[0] or "e+30; a reward is from -100,000" in told[0])
+    output = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning: reward.py")]
+    assert len(output) == 1 and ("ZeroDivisionError" in output[0] or "e+30; a reward is from -100,000" in output[0])

@@ -72,12 +72,12 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
 
 
 def test_a_file_has_the_whole_episodes_that_ended_in_its_iteration(store: Path) -> None:
-    told = {record["iteration"] - 1: record for record in records(Store(store).run("traced"))}
+    message = {record["iteration"] - 1: record for record in records(Store(store).run("traced"))}
     found = files(store, "traced")
-    assert found.keys() == {number for number, record in told.items() if record["episodes"]} and 0 in found
+    assert found.keys() == {number for number, record in message.items() if record["episodes"]} and 0 in found
     for number, rows in found.items():
         ended = episodes(rows)
-        assert len(ended) == told[number]["episodes"]
+        assert len(ended) == message[number]["episodes"]
         numbers = [int(episode[0]["episode"]) for episode in ended]
         # from file 0 deepracer-utils learns how many an iteration can have
         assert numbers == [*range(len(ended) - 1), MOST_CARS * STEPS - 1 if number == 0 else len(ended) - 1]
@@ -86,9 +86,9 @@ def test_a_file_has_the_whole_episodes_that_ended_in_its_iteration(store: Path) 
             assert [row["episode_status"] == "prepare" for row in episode] == [True] + [False] * (len(episode) - 1)
             assert [row["done"] for row in episode] == ["False"] * (len(episode) - 1) + ["True"]
         returns = [sum(float(row["reward"]) for row in episode) for episode in ended]
-        assert sum(returns) / len(ended) == pytest.approx(told[number]["reward"], abs=0.01)
+        assert sum(returns) / len(ended) == pytest.approx(message[number]["reward"], abs=0.01)
         lengths = [len(episode) - 1 for episode in ended]
-        assert sum(lengths) / len(ended) == pytest.approx(told[number]["episode_length"])
+        assert sum(lengths) / len(ended) == pytest.approx(message[number]["episode_length"])
 
 
 def test_the_training_is_the_same_bit_for_bit_without_a_trace(store: Path) -> None:
@@ -150,10 +150,10 @@ def test_deepracer_utils_reads_a_training(store: Path, tmp_path: Path) -> None:
         log = DeepRacerLog(str(run.path))
         log.load_training_trace()
         rows = log.dataframe()
-        there = files(run.path.parents[1], run.name)
-        assert len(rows) == sum(map(len, there.values()))
-        assert set(rows["iteration"]) == there.keys()
-        ended = sum(len(episodes(each)) for each in there.values())
+        present = files(run.path.parents[1], run.name)
+        assert len(rows) == sum(map(len, present.values()))
+        assert set(rows["iteration"]) == present.keys()
+        ended = sum(len(episodes(each)) for each in present.values())
         aggregated = AnalysisUtils.simulation_agg(rows, secondgroup="unique_episode")
         assert len(aggregated) == ended
         assert rows["unique_episode"].max() < SMALL["iterations"] * MOST_CARS * STEPS

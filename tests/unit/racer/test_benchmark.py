@@ -15,8 +15,8 @@ def test_the_racers_table_tells_when_a_car_first_drove_a_lap_and_how_fast_it_is_
         **{"training_rate": 1000.0, "simulation_rate": 150_000.0, "curve": curve, "judged": [early, last]},
         "done": early,
     }
-    said = racer.table([row])
-    assert "| 128 | 2.0 s (3 s of processors), 0.40 M steps | 2.0 s (3 s" in said
-    assert "| 75.0 % | 1,000 steps/s | 150,000 cars · steps/s | 10,000 |" in said  # 150,000 / 15
-    assert "| oval | 2 of 2 | 9.00 | 9.50 |" in said and "| chicane | 1 of 2 | 20.00 | 20.00 |" in said
+    output = racer.table([row])
+    assert "| 128 | 2.0 s (3 s of processors), 0.40 M steps | 2.0 s (3 s" in output
+    assert "| 75.0 % | 1,000 steps/s | 150,000 cars · steps/s | 10,000 |" in output  # 150,000 / 15
+    assert "| oval | 2 of 2 | 9.00 | 9.50 |" in output and "| chicane | 1 of 2 | 20.00 | 20.00 |" in output
     assert "| no | 7.0 s" in racer.table([{**row, "done": None}])

@@ -106,12 +106,12 @@ def test_a_track_that_is_turned_round_is_the_track_driven_backwards(direction: s
     assert {track.direction, turned.direction} == {COUNTER_CLOCKWISE, CLOCKWISE}
     draws = np.random.default_rng(3)
     points = draws.uniform(-9, 9, (500, 2)) * [1, 0.4]
-    there, here = project(track, points, backwards=True), project(turned, points)
-    np.testing.assert_allclose(here.point, there.point, atol=1e-12)
-    np.testing.assert_allclose(here.along, there.along, atol=1e-9)
-    np.testing.assert_array_equal(here.left, there.left)
-    np.testing.assert_array_equal(here.before, there.before)
-    np.testing.assert_allclose(np.cos(here.heading - there.heading), 1)
+    present, here = project(track, points, backwards=True), project(turned, points)
+    np.testing.assert_allclose(here.point, present.point, atol=1e-12)
+    np.testing.assert_allclose(here.along, present.along, atol=1e-9)
+    np.testing.assert_array_equal(here.left, present.left)
+    np.testing.assert_array_equal(here.before, present.before)
+    np.testing.assert_allclose(np.cos(here.heading - present.heading), 1)
 
 
 def test_progress_round_a_circle_is_the_angle() -> None:
@@ -205,11 +205,11 @@ def _place(
 
 
 @wp.kernel
-def _drive(starts: wp.array[CarMotion], asked: wp.array[wp.vec2], lags: wp.vec2, ends: wp.array[CarMotion]):
+def _drive(starts: wp.array[CarMotion], request: wp.array[wp.vec2], lags: wp.vec2, ends: wp.array[CarMotion]):
     car = wp.tid()
     motion = starts[car]
     for _ in range(15):
-        motion = drive(motion, asked[car][0], asked[car][1], 0.0, lags[0], lags[1], 1.0 / 15.0, 4)
+        motion = drive(motion, request[car][0], request[car][1], 0.0, lags[0], lags[1], 1.0 / 15.0, 4)
     ends[car] = motion
 
 
@@ -308,22 +308,22 @@ def by_hand(state: np.ndarray, speed: float, steering: float, lags: tuple[float,
 
 
 def test_the_car_moves_as_a_bicycle_that_is_integrated_by_hand() -> None:
-    asked = np.array([[4.0, 0.5236], [1.0, -0.3], [0.5, 0.1], [2.0, -0.5236]])
+    request = np.array([[4.0, 0.5236], [1.0, -0.3], [0.5, 0.1], [2.0, -0.5236]])
     starts = np.array([[0, 0, 0, 0, 0], [1, 2, -1, 3, 0.4], [0.3, -1, 2, 0.1, 0], [0, 0, 3, 4, 0.5]], float)
     lags = (0.2, 0.05)
     rows = np.array([tuple(row) for row in starts], dtype=CarMotion.numpy_dtype())
     motions = wp.array(rows, dtype=CarMotion)
     ends = wp.zeros(4, dtype=CarMotion)
-    wp.launch(_drive, dim=4, inputs=[motions, wp.array(asked, dtype=wp.vec2), wp.vec2(*lags)], outputs=[ends])
-    for start, (speed, steering), end in zip(starts, asked, ends.numpy(), strict=True):
+    wp.launch(_drive, dim=4, inputs=[motions, wp.array(request, dtype=wp.vec2), wp.vec2(*lags)], outputs=[ends])
+    for start, (speed, steering), end in zip(starts, request, ends.numpy(), strict=True):
         expected = by_hand(start, speed, steering, lags, 1.0)
         np.testing.assert_allclose(list(end), expected, atol=1e-4)
 
 
 def test_without_lag_the_car_drives_the_circle_of_its_steering_at_once() -> None:
     motions, ends = wp.zeros(1, dtype=CarMotion), wp.zeros(1, dtype=CarMotion)
-    asked = wp.array([[1.0, 0.4]], dtype=wp.vec2)
-    wp.launch(_drive, dim=1, inputs=[motions, asked, wp.vec2(0.0, 0.0)], outputs=[ends])
+    request = wp.array([[1.0, 0.4]], dtype=wp.vec2)
+    wp.launch(_drive, dim=1, inputs=[motions, request, wp.vec2(0.0, 0.0)], outputs=[ends])
     x, y, heading, *_ = ends.numpy()[0]
     radius = 0.164 / math.tan(0.4)
     assert heading == pytest.approx(1.0 / radius, abs=1e-4)

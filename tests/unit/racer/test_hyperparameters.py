@@ -44,13 +44,13 @@ def test_a_usual_file_becomes_settings_of_ppo() -> None:
         # 4,096 steps in parts of 64 were 64 parts, more than the steps of a world
         "minibatches": 32,
     }
-    said = {note.split()[0]: note for note in spec.notes}
-    assert said["hyperparameters.batch_size"].endswith(
+    output = {note.split()[0]: note for note in spec.notes}
+    assert output["hyperparameters.batch_size"].endswith(
         "64: a minibatch of each rank has 128 steps, since it has equally many of each world"
     )
     unused = {"e_greedy_value", "epsilon_steps", "term_cond_avg_score", "term_cond_max_episodes", "sac_alpha"}
     close = {"batch_size", "loss_type", "num_episodes_between_training"}
-    assert said.keys() == {f"hyperparameters.{name}" for name in unused | close}
+    assert output.keys() == {f"hyperparameters.{name}" for name in unused | close}
 
 
 def test_a_usual_file_becomes_settings_of_sac() -> None:
@@ -104,7 +104,7 @@ DRAWS = ".exploration_type: ppo and sac draw actions from the policy itself; use
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("fields", "words"),
     [
         ({"lr": 1}, ".lr: expected a number from 1e-08 to 0.001, found 1"),
         ({"lr": "fast"}, ".lr: expected a number from 1e-08 to 0.001, found 'fast'"),
@@ -122,8 +122,8 @@ DRAWS = ".exploration_type: ppo and sac draw actions from the policy itself; use
         ("hyperparameters.json", ": a file is read for a job YAML alone; write its settings out"),
     ],
 )
-def test_an_unusable_hyperparameter_is_refused_in_one_line(given: Any, words: str) -> None:
-    found = refused(given)
+def test_an_unusable_hyperparameter_is_refused_in_one_line(fields: Any, words: str) -> None:
+    found = refused(fields)
     assert found.startswith(words) and "\n" not in found
 
 

@@ -16,7 +16,7 @@ from orchestrator.spec.changes import override
 from orchestrator.spec.compile import compile_definition, long_texts
 from orchestrator.spec.kept_files import changes_with_files, with_files
 from orchestrator.spec.model import validate
-from racer.control.track_orders import ask
+from racer.control.track_orders import carry_out
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import IN_DEFINITION, LARGEST, digest_of
 from tests.support.refusals import refusal
@@ -77,14 +77,14 @@ def test_a_change_of_a_run_has_the_text_of_the_file_whatever_is_in_it() -> None:
     def racer() -> dict[str, Any]:
         return {"train": {"task": "Racer"}}
 
-    given = ["train.iterations=9", "train.config.reward_function=mine.py", "train.config.track=chicane"]
-    first, second, third = changes_with_files(racer, given, no_text)
-    assert (first, third) == (given[0], given[2]) and second.isascii()
+    fields = ["train.iterations=9", "train.config.reward_function=mine.py", "train.config.track=chicane"]
+    first, second, third = changes_with_files(racer, fields, no_text)
+    assert (first, third) == (fields[0], fields[2]) and second.isascii()
     kept = {"file": "mine.py", "text": GOOD}
     assert override({}, [second]) == {"train": {"config": {"reward_function": kept}}}
     (whole,) = changes_with_files(racer, ["train.config={reward_function: mine.py, track: oval}"], no_text)
     assert override({}, [whole])["train"]["config"] == {"reward_function": kept, "track": "oval"}
-    assert changes_with_files(lambda: {"train": {"task": "Ant"}}, given, no_text) == given
+    assert changes_with_files(lambda: {"train": {"task": "Ant"}}, fields, no_text) == fields
 
 
 @pytest.mark.parametrize("train", [_train() | {"task": "elsewhere.mine:Task"}, {"config": 3}, None])
@@ -97,8 +97,8 @@ def test_no_file_is_read_for_fields_that_name_none(train: Any) -> None:
 def test_an_error_in_a_file_is_reported_at_the_line_that_names_it(directory: Path) -> None:
     (directory / "mine.py").write_text("import os\n" + GOOD)
     refused = refusal(specfile.load, "job.yaml", error=SpecError)
-    said = "mine.py:1: IMPORT_ERROR: os can't be imported; a reward function may import math, random, numpy, scipy, shapely"
-    assert refused == f"job.yaml:7: train.config.reward_function: {said}"
+    output = "mine.py:1: IMPORT_ERROR: os can't be imported; a reward function may import math, random, numpy, scipy, shapely"
+    assert refused == f"job.yaml:7: train.config.reward_function: {output}"
     (directory / "mine.py").unlink()
     refused = refusal(specfile.load, "job.yaml", error=SpecError)
     here = f"a path is relative to the directory of the command, {directory}"
@@ -116,8 +116,8 @@ def test_a_text_that_does_not_fit_into_a_definition_is_kept_beside_the_job_and_t
     (directory / "mine.py").write_text(text)
     long = specfile.load("job.yaml")
     assert long_texts(long) == [text]
-    told = f"train.config.reward_function: mine.py: {len(text.encode()):,} bytes: kept beside the job"
-    assert long.notes == (told,)
+    message = f"train.config.reward_function: mine.py: {len(text.encode()):,} bytes: kept beside the job"
+    assert long.notes == (message,)
     definition = json.dumps(compile_definition(long, ""))
     assert digest_of(text) in definition and len(definition) < 4096
 
@@ -157,7 +157,7 @@ def test_a_digest_stands_for_a_text_and_never_beside_one() -> None:
 
 @pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "output"),
     [
         (b"{\n 1", r"space\.json:2: it is not JSON \(Expecting property name"),
         (b"\xff\xfe", r"space\.json: it is not a text file \(UTF-8\)"),
@@ -168,9 +168,9 @@ def test_a_digest_stands_for_a_text_and_never_beside_one() -> None:
         ),
     ],
 )
-def test_an_action_space_is_checked_when_its_file_is_read(directory: Path, content: bytes, said: str) -> None:
+def test_an_action_space_is_checked_when_its_file_is_read(directory: Path, content: bytes, output: str) -> None:
     (directory / "space.json").write_bytes(content)
-    with pytest.raises(SpecError, match=said):
+    with pytest.raises(SpecError, match=output):
         config(["train.config.action_space=space.json"])
 
 
@@ -218,7 +218,7 @@ def test_a_reward_function_is_tried_on_the_job_s_own_track(directory: Path) -> N
 def test_a_track_of_the_store_is_tried_where_the_store_is_here_and_noted_where_it_is_not(directory: Path) -> None:
     (directory / "mine.py").write_text(FAR)
     store = Store(directory / "store").open()
-    ask(
+    carry_out(
         {
             "action": "make",
             "name": "short",

@@ -29,18 +29,18 @@ def cup(store: Store) -> StoredLeague:
 def test_a_league_is_kept_as_it_was_created(store: Store) -> None:
     assert leagues.names(store) == []
     rules = Rules(laps=5, continuous=True, ranking="best")
-    given = league("cup", track=("oval", "hills"), rules=rules, closes=2000.0, track_digests={"hills": "ab"})
-    created = leagues.create(store, given)
+    fields = league("cup", track=("oval", "hills"), rules=rules, closes=2000.0, track_digests={"hills": "ab"})
+    created = leagues.create(store, fields)
     assert created.path == store.path / "leagues" / "cup" and leagues.names(store) == ["cup"]
-    assert leagues.find(store, "cup").definition() == given and given.car == leagues.CAR
+    assert leagues.find(store, "cup").definition() == fields and fields.car == leagues.CAR
     files = [path for path in created.path.rglob("*") if path.is_file()]
     assert all(path.stat().st_mode & 0o222 == 0 for path in files), "nothing of it may be written"
 
 
 def test_a_league_is_never_changed(store: Store, cup: StoredLeague, monkeypatch: pytest.MonkeyPatch) -> None:
-    said = r"^league cup exists already, and a league is never changed; choose another name$"
+    output = r"^league cup exists already, and a league is never changed; choose another name$"
     for _ in range(2):
-        with pytest.raises(LeagueError, match=said):
+        with pytest.raises(LeagueError, match=output):
             leagues.create(store, league(seed=8))
         monkeypatch.setattr(leagues, "names", lambda store: [])  # it looked before the other one was done
     assert cup.definition().seed == 7
@@ -99,7 +99,7 @@ ENTRY = Path("entries") / "1"
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "output"),
     [
         (
             lambda cup: alter(cup.path / ENTRY / "entry.json", b"12.5", b"11.5"),
@@ -116,29 +116,29 @@ ENTRY = Path("entries") / "1"
     ],
 )
 def test_an_altered_entry_is_not_ranked_and_the_others_are(
-    cup: StoredLeague, change: Callable[[StoredLeague], Any], said: str
+    cup: StoredLeague, change: Callable[[StoredLeague], Any], output: str
 ) -> None:
     cup.enter(entry("ada", version=1))
     cup.enter(entry("bob", version=2, race=race([14.0, 14.0, 14.0])))
     for path in (cup.path / "entries").rglob("*.json"):
         path.chmod(0o644)
     change(cup)
-    with pytest.raises(LeagueError, match=f"^league cup: {said}"):
+    with pytest.raises(LeagueError, match=f"^league cup: {output}"):
         cup.entry(1)
     rows = table(cup.contenders(), "total")
     assert [(row.rank, row.entry, row.status) for row in rows] == [(1, 2, "ranked"), (None, 1, "altered")]
     assert rows[1].racer == "-" and rows[1].time is None
-    told = rows[1].reason.partition(str(cup.path))[0]
-    assert rows[1].reason and "entry 1" not in rows[1].reason and "cup" not in told
+    message = rows[1].reason.partition(str(cup.path))[0]
+    assert rows[1].reason and "entry 1" not in rows[1].reason and "cup" not in message
     assert cup.enter(entry("cat", version=3))["entry"] == 3, "its number is not given again"
 
 
 def test_an_altered_league_has_no_ranking_and_accepts_no_entries(cup: StoredLeague) -> None:
     cup.enter(entry())
     alter(cup.path / "definition" / "league.json", b'"laps": 3', b'"laps": 1')
-    for ask in (cup.definition, cup.digest, lambda: cup.enter(entry(version=2))):
+    for send in (cup.definition, cup.digest, lambda: cup.enter(entry(version=2))):
         with pytest.raises(LeagueError, match=r"^league cup: the content of league.json was altered"):
-            ask()
+            send()
     assert [row.status for row in table(cup.contenders(), "total")] == ["altered"]
 
 
@@ -154,7 +154,7 @@ def test_new_rules_in_the_place_of_the_old_ones_leave_the_old_entries_behind(cup
 
 
 def test_an_entry_that_is_sealed_but_is_none_is_refused(cup: StoredLeague) -> None:
-    for change, said in (
+    for change, output in (
         ({"racer": 5}, "names no racer, owner, model or evaluation"),
         ({"model": {"name": "fast"}}, "names no racer"),
         ({"race": {**race([12.0]), "trials": []}}, "race: expected rules.laps and as many trials"),
@@ -164,7 +164,7 @@ def test_an_entry_that_is_sealed_but_is_none_is_refused(cup: StoredLeague) -> No
         whole = {**entry(), **change, "entry": 1, "league": {"name": "cup", "digest": cup.digest()}}
         write_json(path / "entry.json", whole)
         seal(path, {})
-        with pytest.raises(LeagueError, match=f"^league cup: entry 1:? {said}"):
+        with pytest.raises(LeagueError, match=f"^league cup: entry 1:? {output}"):
             cup.entry(1)
         shutil.rmtree(path)
 
@@ -191,8 +191,8 @@ def test_an_owner_has_a_limited_number_of_entries_and_a_unique_name(store: Store
     cup.enter(entry("ada", version=1))
     with pytest.raises(LeagueError, match=r"^league cup: entry 1 has this evaluation already$"):
         cup.enter(entry("ada", version=1))
-    said = r"^league cup: racer ada is another's, who made entry 1; choose another name$"
-    with pytest.raises(LeagueError, match=said):
+    output = r"^league cup: racer ada is another's, who made entry 1; choose another name$"
+    with pytest.raises(LeagueError, match=output):
         cup.enter(entry("ada", owner="user eve", version=2))
     cup.enter(entry("second ada", owner="user ada", version=3))
     with pytest.raises(LeagueError, match=r"^league cup: user ada has made 2 entries, as many as one may make$"):
@@ -201,20 +201,20 @@ def test_an_owner_has_a_limited_number_of_entries_and_a_unique_name(store: Store
 
 
 def enter_five(path: str, number: str) -> list[int]:
-    cup, given = leagues.find(Store(path), "cup"), list[int]()
+    cup, fields = leagues.find(Store(path), "cup"), list[int]()
     for version in range(5):
         try:
             made = cup.enter(entry(f"r{number}", owner="user one", version=100 * int(number) + version))
-            given.append(made["entry"])
+            fields.append(made["entry"])
         except LeagueError as error:
             assert "as many as one may make" in str(error), error
-    return given
+    return fields
 
 
 def test_processes_that_enter_at_once_get_a_number_each_and_no_more_than_are_allowed(store: Store) -> None:
     leagues.create(store, league(most_entries=8))
-    given = at_once(enter_five, [(str(store.path), number) for number in "012"])
-    assert sorted(entry for each in given for entry in each) == list(range(1, 9))
+    fields = at_once(enter_five, [(str(store.path), number) for number in "012"])
+    assert sorted(entry for each in fields for entry in each) == list(range(1, 9))
 
 
 def test_a_league_is_open_from_its_first_moment_to_its_last_and_the_presets_are_those_of_the_racer() -> None:
@@ -229,11 +229,11 @@ def test_a_league_is_open_from_its_first_moment_to_its_last_and_the_presets_are_
 
 
 @pytest.mark.parametrize(
-    ("changes", "said"),
+    ("changes", "output"),
     [
         ({}, ""),
         ({"race": race([12.0, 12.0, 12.0], ranking="best")}, ""),
-        ({"race": None}, "it is no race"),
+        ({"race": None}, "it is not a race"),
         ({"race": race([12.0])}, "its rules have laps 1, the league's 3"),
         ({"race": race([12.0] * 3, continuous=True)}, "its rules have continuous True, the league's False"),
         ({"race": race([12.0] * 3, continuous=0)}, "its rules have continuous 0, the league's False"),
@@ -246,8 +246,8 @@ def test_a_league_is_open_from_its_first_moment_to_its_last_and_the_presets_are_
         ({"config": {**CONFIG, "start": "random"}}, "its config.start is 'random', the league's 'line'"),
     ],
 )
-def test_an_evaluation_of_other_rules_is_not_of_the_league(changes: dict[str, Any], said: str) -> None:
-    assert league().misfit(summary(race([12.0, 12.5, 13.0])) | changes) == said
+def test_an_evaluation_of_other_rules_is_not_of_the_league(changes: dict[str, Any], output: str) -> None:
+    assert league().misfit(summary(race([12.0, 12.5, 13.0])) | changes) == output
 
 
 def test_the_tracks_of_a_league_can_not_change(store: Store) -> None:
@@ -270,6 +270,6 @@ def test_links_out_of_the_store_are_not_followed(store: Store, tmp_path: Path) -
     leagues.create(store, league())
     shutil.rmtree(store.path / "leagues")
     os.symlink(tmp_path, store.path / "leagues")
-    for ask in (lambda: leagues.names(store), lambda: leagues.create(store, league("two"))):
+    for send in (lambda: leagues.names(store), lambda: leagues.create(store, league("two"))):
         with pytest.raises(LeagueError, match="links inside a run are not followed"):
-            ask()
+            send()

@@ -159,8 +159,8 @@ def test_a_car_drives_from_the_start_to_the_end_which_completes_its_lap() -> Non
 
 def test_an_episode_that_begins_farther_on_makes_a_lap_of_the_rest_and_no_lap_time() -> None:
     task = driver(8, start="round_robin", start_step=0.11)
-    begun = known(task, "along")
-    assert (known(task, "wheels") == 4).all() and begun.max() < END - 0.8 and np.ptp(begun) > 0.6 * END
+    started = known(task, "along")
+    assert (known(task, "wheels") == 4).all() and started.max() < END - 0.8 and np.ptp(started) > 0.6 * END
     first = task.first_world
     assert first == 0
     done = np.zeros(8, bool)

@@ -58,16 +58,16 @@ def drive(gain: float = 1.0, learns: bool = False, **section: Any) -> tuple[Race
 
 def test_a_lap_takes_as_long_as_its_control_steps_and_three_alike_take_three_times_that() -> None:
     _, played, race = drive()
-    told = race.summary()
+    message = race.summary()
     steps = int(played.lengths[0])
     assert 0.9 * OVAL.length < 1.25 * steps / 15 < OVAL.length  # 1.25 m/s, with curves cut
-    first = told["trials"][0]
+    first = message["trials"][0]
     assert (first["trial"], first["status"], first["completion"]) == (1, "lap_complete", 100.0)
     assert first["steps"] == steps and first["lap_time"] == first["time"] == steps / 15
     assert (first["penalty"], first["off_tracks"], first["resets"], first["seed"]) == (0.0, 0, 0, 5)
-    assert told["completed"] == 3 and told["total_time"] == pytest.approx(3 * steps / 15, rel=1e-12)
-    assert told["best_lap"] == steps / 15 and told["average_lap"] == pytest.approx(steps / 15, rel=1e-12)
-    assert (told["track"], told["direction"]) == (["oval"], "counter-clockwise")
+    assert message["completed"] == 3 and message["total_time"] == pytest.approx(3 * steps / 15, rel=1e-12)
+    assert message["best_lap"] == steps / 15 and message["average_lap"] == pytest.approx(steps / 15, rel=1e-12)
+    assert (message["track"], message["direction"]) == (["oval"], "counter-clockwise")
     yaw = SIM_TRACE_COLUMNS.index("yaw")
     headings = [float(line.split(",")[yaw]) for line in list(race.trials[0].sim_trace(0))[1:]]
     turned = np.diff(np.unwrap(np.radians(headings))).sum()
@@ -78,12 +78,12 @@ def test_a_lap_of_an_open_track_is_timed_from_end_to_end(tmp_path: Path, monkeyp
     keep(Store(tmp_path).open(), open_track(), {})
     monkeypatch.setenv("MUSTER_STORE", str(tmp_path))
     _, played, race = drive(track="horseshoe", trials=2)
-    told = race.summary()
+    message = race.summary()
     steps = int(played.lengths[0])
     assert 0.9 * (open_track().length - 0.29) < 1.25 * steps / 15 < open_track().length
-    assert [(trial["status"], trial["completion"]) for trial in told["trials"]] == [("lap_complete", 100.0)] * 2
-    assert (told["completed"], told["best_lap"]) == (2, steps / 15)
-    assert (told["track"], told["direction"]) == (["horseshoe"], "open")
+    assert [(trial["status"], trial["completion"]) for trial in message["trials"]] == [("lap_complete", 100.0)] * 2
+    assert (message["completed"], message["best_lap"]) == (2, steps / 15)
+    assert (message["track"], message["direction"]) == (["horseshoe"], "open")
 
 
 def test_two_runs_of_a_race_are_the_same_bit_for_bit() -> None:
@@ -96,14 +96,14 @@ def test_two_runs_of_a_race_are_the_same_bit_for_bit() -> None:
 
 def test_a_trial_ends_with_its_first_mishap_where_no_car_is_put_back() -> None:
     _, played, race = drive(gain=0.0, trials=2, off_track_penalty=3.0)
-    told = race.summary()
-    for trial in told["trials"]:
+    message = race.summary()
+    for trial in message["trials"]:
         assert (trial["status"], trial["lap_time"]) == ("off_track", None)
         assert (trial["off_tracks"], trial["resets"], trial["penalty"]) == (1, 0, 3.0)
         assert trial["time"] == played.lengths[0].item() / 15 + 3.0
         assert 5.0 < trial["completion"] < 30.0
-    assert (told["completed"], told["off_tracks"]) == (0, 2)
-    assert [told[name] for name in ("total_time", "best_lap", "average_lap")] == [None] * 3
+    assert (message["completed"], message["off_tracks"]) == (0, 2)
+    assert [message[name] for name in ("total_time", "best_lap", "average_lap")] == [None] * 3
 
 
 def test_penalties_count_in_a_trial_s_time_but_not_in_its_lap_time() -> None:
@@ -136,8 +136,8 @@ def test_a_step_log_has_a_row_a_step_as_deepracer_s_tools_read_it(tmp_path: Path
     task, played, race = drive(gain=0.0, trials=1, continuous=True, max_resets=1)
     race.write(tmp_path / "00000030-e1-job")
     (path,) = tmp_path.rglob("*.csv")
-    there = "00000030-e1-job/sim-trace/evaluation/00000030-e1-job/evaluation-simtrace/0-iteration.csv"
-    assert path == tmp_path / there
+    present = "00000030-e1-job/sim-trace/evaluation/00000030-e1-job/evaluation-simtrace/0-iteration.csv"
+    assert path == tmp_path / present
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == SIM_TRACE_COLUMNS and len(rows) == 1 + int(played.lengths[0])
@@ -182,12 +182,12 @@ def test_trials_use_the_tracks_in_turn_and_the_table_agrees_with_the_summary(tmp
     assert race.summary()["track"] == ["oval", "chicane"]
     run = Run(tmp_path / "fast")
     run.evaluations.mkdir(parents=True)
-    told = result_of(task, played, "00000030-e1", 5, 0.0).write(run, "job", {"race": race})
-    assert told["race"] == json.loads((run.evaluations / "00000030-e1-job.json").read_text())["race"]
-    table = pyarrow.parquet.read_table(run.evaluations / told["table"]).to_pydict()
+    message = result_of(task, played, "00000030-e1", 5, 0.0).write(run, "job", {"race": race})
+    assert message["race"] == json.loads((run.evaluations / "00000030-e1-job.json").read_text())["race"]
+    table = pyarrow.parquet.read_table(run.evaluations / message["table"]).to_pydict()
     for name, values in table.items():
-        if name in told["race"]["trials"][0] and name != "seed":
-            assert values == [trial[name] for trial in told["race"]["trials"]], name
+        if name in message["race"]["trials"][0] and name != "seed":
+            assert values == [trial[name] for trial in message["race"]["trials"]], name
     columns = {"trial", "status", "completion", "lap_time", "time", "off_tracks", "resets", "penalty", "steps"}
     assert columns <= set(table)
     assert len(list(run.evaluations.rglob("*-iteration.csv"))) == 3
@@ -233,9 +233,9 @@ def test_a_car_that_leaves_the_road_is_put_back_on_the_centre_line_a_metre_behin
     assert not task.worlds.arrays.joint_qd.numpy()[0].any()
     # what is seen is seen from there, and what is lost of the way has to be driven again
     direction = np.array([math.cos(headings[0]), math.sin(headings[0])])
-    there = float(project(OVAL, points + 0.14 * direction).along[0])
-    assert known(task, "travelled")[0] == pytest.approx(there - 0.14, abs=1e-3)
-    (ahead,) = place_at(OVAL, [there + 0.3])[0] - points - 0.14 * direction
+    present = float(project(OVAL, points + 0.14 * direction).along[0])
+    assert known(task, "travelled")[0] == pytest.approx(present - 0.14, abs=1e-3)
+    (ahead,) = place_at(OVAL, [present + 0.3])[0] - points - 0.14 * direction
     column = task.observation_names.index("waypoint_0_x")
     assert task.observations[0, column].item() == pytest.approx(float(ahead @ direction), abs=1e-3)
     assert counts(task) == {"crashed": 0, "off_track": 1, "immobilized": 0, "reversed": 0, "resets": 1}

@@ -35,8 +35,8 @@ def test_the_racers_tasks_are_known_by_name() -> None:
 
 
 def test_a_checkpoint_is_named_as_every_kind_of_job_names_it() -> None:
-    for wanted in (3, "best", "latest"):
-        found: Any = validate({"name": "a", "race": {"run": "x", "checkpoint": wanted}}, "job.yaml")
-        assert found.race.checkpoint == wanted
+    for expected in (3, "best", "latest"):
+        found: Any = validate({"name": "a", "race": {"run": "x", "checkpoint": expected}}, "job.yaml")
+        assert found.race.checkpoint == expected
     with pytest.raises(SpecError, match=r"^job\.yaml: race\.checkpoint: expected an iteration, best or latest"):
         validate({"name": "a", "race": {"run": "x", "checkpoint": "newest"}}, "job.yaml")

@@ -155,8 +155,8 @@ def test_choices_are_those_of_the_metadata() -> None:
     task = racer(5, track="oval", action_space=DISCRETE)
     assert task.discrete and task.action_names[0] == "0: 30 degrees, 0.6 m/s" and task.actions.shape == (5, 1)
     task.step(torch.arange(5.0)[:, None])
-    asked = [(math.radians(each["steering_angle"]), each["speed"]) for each in FIVE]
-    np.testing.assert_allclose(known(task, "commands"), asked, atol=1e-6)
+    request = [(math.radians(each["steering_angle"]), each["speed"]) for each in FIVE]
+    np.testing.assert_allclose(known(task, "commands"), request, atol=1e-6)
     assert policy_contract(task, "Racer").discrete
 
 
@@ -220,10 +220,10 @@ def noted(space: Any, algorithm: str = "ppo") -> list[str]:
 
 def test_actions_out_of_the_car_s_range_are_clipped_as_aws_s_simulator_does_with_a_note_for_each_kind() -> None:
     wild = [(45, 5), (-30, "8"), (0, 0.05), ("-31.5", 4), (30, 0.1)]
-    asked = [{"steering_angle": angle, "speed": speed, "index": number} for number, (angle, speed) in enumerate(wild)]
-    asked[0]["name"] = "left"  # nor does AWS look at it
+    request = [{"steering_angle": angle, "speed": speed, "index": number} for number, (angle, speed) in enumerate(wild)]
+    request[0]["name"] = "left"  # nor does AWS look at it
     clipped = ((30.0, 4.0), (-30.0, 4.0), (0.0, 0.1), (-30.0, 4.0), (30.0, 0.1))
-    for content in (asked, {"action_space": asked}):  # older files hold the list alone
+    for content in (request, {"action_space": request}):  # older files hold the list alone
         config = RacerConfig(action_space=content)
         assert config.actions().choices == clipped
         assert noted(content) == [
@@ -324,8 +324,8 @@ def test_an_image_and_numbers_are_groups_of_their_own() -> None:
 
 def test_a_policy_means_the_same_on_another_track_and_by_other_rules() -> None:
     here = racer(track="oval")
-    there = racer(track=("chicane", "random:3"), continuous=True, trace=True, speed_lag=0.1)
-    assert policy_contract(here, "Racer") == policy_contract(there, "Racer")
+    present = racer(track=("chicane", "random:3"), continuous=True, trace=True, speed_lag=0.1)
+    assert policy_contract(here, "Racer") == policy_contract(present, "Racer")
 
 
 def test_a_bundle_has_the_actions_and_the_sensors_as_deepracer_names_them() -> None:

@@ -100,7 +100,7 @@ def test_a_race_is_read_with_its_penalties_and_its_times_are_equal_to_the_millis
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "output"),
     [
         (lambda found: found["trials"].pop(), "race: expected rules.laps and as many trials, found laps 3"),
         (lambda found: found["rules"].pop("laps"), "race: expected rules.laps and as many trials, found laps None"),
@@ -112,12 +112,12 @@ def test_a_race_is_read_with_its_penalties_and_its_times_are_equal_to_the_millis
         (lambda found: found["trials"][2].update(crashes="1"), "race.trials.2.crashes: expected a whole number"),
     ],
 )
-def test_a_malformed_race_is_refused_with_its_place(change: Any, said: str) -> None:
+def test_a_malformed_race_is_refused_with_its_place(change: Any, output: str) -> None:
     found = race([12.0, 12.5, 13.0])
     change(found)
-    with pytest.raises(BadRace, match=f"^{said}"):
+    with pytest.raises(BadRace, match=f"^{output}"):
         read_race(found)
-    with pytest.raises(BadRace, match="it is no race: its summary has no key race"):
+    with pytest.raises(BadRace, match="it is not a race: its summary has no key race"):
         read_race(None)
 
 

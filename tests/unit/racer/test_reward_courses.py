@@ -37,7 +37,7 @@ RING = Track("ring", *(radius * np.stack((np.cos(TURNS), np.sin(TURNS)), 1) for 
 BOXES = (ObstacleConfig(2.0, "inner"), ObstacleConfig(8.0, "outer"), ObstacleConfig(9.5, "center"))
 
 
-def told(source: str, *names: str, boxes: tuple[ObstacleConfig, ...] = ()) -> tuple[str, list[str]]:
+def message(source: str, *names: str, boxes: tuple[ObstacleConfig, ...] = ()) -> tuple[str, list[str]]:
     """The guard's answer on these tracks, and its notes."""
     notes: list[str] = []
     courses = courses_of(circuit_of([resolve(name, None) for name in names], boxes))
@@ -47,14 +47,14 @@ def told(source: str, *names: str, boxes: tuple[ObstacleConfig, ...] = ()) -> tu
 
 
 def test_a_function_that_needs_objects_is_valid_with_the_job_s_and_noted_without() -> None:
-    assert told(NEXT, "oval", boxes=BOXES) == ("", [])
-    problem, (note,) = told(NEXT, "oval")
+    assert message(NEXT, "oval", boxes=BOXES) == ("", [])
+    problem, (note,) = message(NEXT, "oval")
     assert problem == "" and note == (
         "r.py:3: it fails where there are no objects, as in this job (the sample 'start': IndexError: list index out of range, "
         "on track oval with 133 waypoints); it is valid, since it passes with objects, with which AWS tries it: add obstacles"
     )
     broken = NEXT.replace('["closest_objects"]', '["closest_object"]')
-    assert told(broken, "oval") == (
+    assert message(broken, "oval") == (
         "r.py:2: TEST_FAILURE: the sample 'start': KeyError: 'closest_object', on track oval with 133 waypoints",
         [],
     )
@@ -62,8 +62,8 @@ def test_a_function_that_needs_objects_is_valid_with_the_job_s_and_noted_without
 
 def test_a_function_that_fails_with_objects_is_valid_in_a_job_without() -> None:
     many = "def reward_function(params):\n    return 1.0 / (3 - len(params['objects_speed']))\n"
-    assert told(many, "oval") == ("", [])
-    problem, _ = told(many, "oval", boxes=BOXES)
+    assert message(many, "oval") == ("", [])
+    problem, _ = message(many, "oval", boxes=BOXES)
     assert (
         problem
         == "r.py:2: TEST_FAILURE: the sample 'start': ZeroDivisionError: float division by zero, on track oval with 133 waypoints"
@@ -71,9 +71,9 @@ def test_a_function_that_fails_with_objects_is_valid_in_a_job_without() -> None:
 
 
 def test_a_waypoint_that_the_job_s_track_has_may_be_asked_for() -> None:
-    assert told(FAR, "chicane") == ("", [])
+    assert message(FAR, "chicane") == ("", [])
     problem = "r.py:2: TEST_FAILURE: the sample 'start': IndexError: list index out of range, on track oval with 133 waypoints"
-    assert told(FAR, "oval")[0] == told(FAR, "chicane", "oval")[0] == problem
+    assert message(FAR, "oval")[0] == message(FAR, "chicane", "oval")[0] == problem
     assert check_source(FAR, "r.py", [FINE_OVAL], anyway=True) is None
 
 
@@ -108,11 +108,11 @@ def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[Obsta
             np.testing.assert_array_equal(params["waypoints"], track.line()[:: -1 if back else 1])
             assert max(params["closest_waypoints"]) < len(params["waypoints"])
             places = np.array(params["objects_location"]).reshape(-1, 2)
-            there = project(track, places, back)
-            np.testing.assert_allclose(there.along, params["objects_distance"], atol=0.06)
+            present = project(track, places, back)
+            np.testing.assert_allclose(present.along, params["objects_distance"], atol=0.06)
             np.testing.assert_array_equal(
-                there.left[there.distance > 0.01],
-                np.array(params["objects_left_of_center"], bool)[there.distance > 0.01],
+                present.left[present.distance > 0.01],
+                np.array(params["objects_left_of_center"], bool)[present.distance > 0.01],
             )
             if len(places):
                 gaps = np.array(params["objects_distance"]) - params["projection_distance"]

@@ -21,7 +21,7 @@ from tests.support.racer.racing import round_the_guard
 HEAD = "def reward_function(params):\n    "
 
 
-def told(source: str) -> str:
+def output(source: str) -> str:
     """The problem in one line; empty: there is none."""
     problem = check_source(source, "r.py")
     assert problem is None or (problem.kind in KINDS and "\n" not in str(problem))
@@ -84,7 +84,7 @@ def test_a_text_that_cannot_be_used_is_refused_without_running_it(
     source: str, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(guard, "try_out", lambda *_, **__: pytest.fail("it was run"))
-    assert told(source) == f"r.py{message}"
+    assert output(source) == f"r.py{message}"
 
 
 NONE = "it returned None; return a number on every way through the function"
@@ -119,7 +119,7 @@ LARGE = "it returned -100000.5; a reward is from -100,000 to 100,000, as on AWS"
 def test_a_function_that_fails_on_a_sample_is_refused_with_the_sample_and_the_line(
     line: int, sample: str, message: str, body: str
 ) -> None:
-    assert told(f"{HEAD}{body}") == f"r.py:{line}: TEST_FAILURE: the sample '{sample}': {message}"
+    assert output(f"{HEAD}{body}") == f"r.py:{line}: TEST_FAILURE: the sample '{sample}': {message}"
 
 
 @pytest.mark.parametrize(
@@ -134,29 +134,29 @@ def test_a_function_that_fails_on_a_sample_is_refused_with_the_sample_and_the_li
     ],
 )
 def test_a_value_of_numpy_that_is_no_number_is_no_reward(value: str, message: str) -> None:
-    assert told(f"import numpy as np\n{HEAD}return {value}") == f"r.py:2: TEST_FAILURE: the sample 'start': {message}"
-    assert told(f"import numpy as np\n{HEAD}return np.array(1.5) + np.int64(2) * np.uint8(1)") == ""
+    assert output(f"import numpy as np\n{HEAD}return {value}") == f"r.py:2: TEST_FAILURE: the sample 'start': {message}"
+    assert output(f"import numpy as np\n{HEAD}return np.array(1.5) + np.int64(2) * np.uint8(1)") == ""
 
 
 def test_an_exception_that_cannot_be_shown_is_named_with_its_line() -> None:
     source = f"class Odd(Exception):\n    def __str__(self):\n        return [][0]\n{HEAD}raise Odd()\n"
     why = "Odd: its message can't be shown, since its __str__ raises IndexError"
-    assert told(source) == f"r.py:5: TEST_FAILURE: the sample 'start': {why}"
+    assert output(source) == f"r.py:5: TEST_FAILURE: the sample 'start': {why}"
 
 
 def test_of_two_definitions_the_last_counts_and_underscores_of_own_objects_are_taken() -> None:
     twice = f"{HEAD}return None\n{HEAD}return 2.0"
-    assert told(twice) == ""
+    assert output(twice) == ""
     own = f"class Car:\n    def __init__(self):\n        self._last = 1.0\ncar = Car()\n{HEAD}return car._last"
-    assert told(own) == ""
+    assert output(own) == ""
     private = (
         '__version__ = "1"\nclass Car:\n    __slots__ = ("__best", "io")\n    def __init__(self):\n        self.__best = 1.0\n'
         "        self.io = self.__best\n    __call__ = lambda self: self.io\n    __repr__ = __call__\ncar = Car()\n"
         f"{HEAD}__near = car.__call__()\n    return __near + len(type(car).__name__ + __version__)"
     )
-    assert told(private) == ""
+    assert output(private) == ""
     hidden = f"import random\nbox = [random]\n{HEAD}r = box[0]\n    return r._inst.random()"
-    assert told(hidden) == "r.py:5: FORBIDDEN: the sample 'start': random._inst can't be used in a reward function"
+    assert output(hidden) == "r.py:5: FORBIDDEN: the sample 'start': random._inst can't be used in a reward function"
 
 
 @pytest.mark.parametrize("config", ["[1]", "{", "3", "null"])
@@ -185,7 +185,7 @@ def test_a_configuration_of_the_check_that_is_no_mapping_is_refused_in_one_line(
     ],
 )
 def test_a_flood_of_text_and_an_error_of_the_module_are_refused_with_their_line(source: str, message: str) -> None:
-    assert told(source) == f"r.py:{message.format('TEST_FAILURE')}".replace("::", ":")
+    assert output(source) == f"r.py:{message.format('TEST_FAILURE')}".replace("::", ":")
 
 
 @pytest.mark.parametrize(
@@ -210,7 +210,7 @@ def test_a_module_outside_the_packages_and_a_function_for_files_are_refused_by_w
     source: str, message: str
 ) -> None:
     line, _, rest = message.partition(": ")
-    assert told(source) == f"r.py:{line}: FORBIDDEN: {rest} can't be used in a reward function"
+    assert output(source) == f"r.py:{line}: FORBIDDEN: {rest} can't be used in a reward function"
 
 
 def test_what_the_packages_need_inside_themselves_works() -> None:
@@ -220,7 +220,7 @@ def test_what_the_packages_need_inside_themselves_works() -> None:
         "    line = interpolate.interp1d([0.0, 1.0], [1.0, 3.0])(0.5) + scipy.spatial.distance.euclidean([0.0], [2.0])\n"
         "    return float(np.emath.sqrt(4.0) + np.fft.fft([1.0]).real[0] + near + line + np.random.default_rng(1).random())\n"
     )
-    assert told(source) == ""
+    assert output(source) == ""
 
 
 CATCHING = "while True:\n        try:\n            while True: pass\n        except: pass"
@@ -253,7 +253,7 @@ def test_a_function_that_loops_for_ever_is_refused_with_its_line(body: str, monk
     ],
 )
 def test_a_valid_function_is_accepted_whatever_its_words(source: str) -> None:
-    assert told(source) == ""
+    assert output(source) == ""
 
 
 def test_a_tried_function_writes_no_file_and_sees_no_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -262,7 +262,7 @@ def test_a_tried_function_writes_no_file_and_sees_no_secret(tmp_path: Path, monk
     monkeypatch.setattr(guard, "read", lambda *_: None)  # as one who gets round it would
     source = f"import os\n{HEAD}assert 'MUSTER_TOKEN' not in os.environ\n    open({str(kept)!r}, 'w').write('x' * 9999)\n    return 1"
     denied = f"PermissionError: [Errno 1] Operation not permitted: {str(kept)!r}"
-    assert told(round_the_guard(source)) == f"r.py:4: TEST_FAILURE: the sample 'start': {denied}"
+    assert output(round_the_guard(source)) == f"r.py:4: TEST_FAILURE: the sample 'start': {denied}"
     assert not kept.exists()
 
 
@@ -284,8 +284,8 @@ def test_the_command_reports_errors_or_the_mode_of_execution(
     long.write_text(f"{HEAD}return params['speed']\n{'#' * 21_000}\n")
     monkeypatch.setattr(sys, "argv", ["rewards", str(good), str(slow), str(bad), str(long)])
     assert main() == 1
-    said, errors = capsys.readouterr()
-    assert said.splitlines() == [
+    text, errors = capsys.readouterr()
+    assert text.splitlines() == [
         f"{good}: valid, compiled to the device",
         "  line 2: print() is left out",
         f"{slow}: valid, not compiled",
@@ -328,7 +328,7 @@ def test_a_row_of_the_arrays_holds_all_that_a_dictionary_does() -> None:
 def test_the_page_has_the_table_of_the_contract_and_an_example_that_is_valid_and_compiles() -> None:
     page = (REPOSITORY / "docs" / "racer" / "rewards.md").read_text()
     source = page.split("```python\n")[1].split("```")[0]
-    assert table() in page and told(source) == "" and translate(source).notes == ()
+    assert table() in page and output(source) == "" and translate(source).notes == ()
 
 
 def test_the_characters_of_a_large_file_are_counted_to_its_end(tmp_path: Path) -> None:

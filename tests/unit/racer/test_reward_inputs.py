@@ -43,7 +43,7 @@ def rewarded(text: str, worlds: int = 1, **fields: Any) -> Racer:
     )
 
 
-def told(task: Racer, world: int) -> dict[str, Any]:
+def output(task: Racer, world: int) -> dict[str, Any]:
     """``params`` of a car's function in the last step."""
     race = task.sensors["race"].arrays
     numbers = race.numbers.numpy()[world].tolist()
@@ -70,7 +70,7 @@ def test_a_function_s_parameters_agree_with_the_track_s_geometry(driven: Racer) 
         ended = driven.dones.numpy()
         poses, commands = known(driven, "poses"), known(driven, "commands")
         for world in range(24):
-            params = told(driven, world)
+            params = output(driven, world)
             if ended[world]:  # its car was placed afresh since
                 seen["off"] += params["is_offtrack"]
                 seen["crashed"] += params["is_crashed"]
@@ -149,7 +149,7 @@ def test_an_object_is_in_the_camera_where_a_corner_of_it_is_in_the_image(
     reward = RewardFile("reward.py", STEER)
     task = RacerPixels(RacerPixelsConfig(reward_function=reward, front=front, **fields), 1, seed=3)
     task.step(torch.zeros(1, 2))
-    assert told(task, 0)["object_in_camera"] is sees
+    assert output(task, 0)["object_in_camera"] is sees
 
 
 def test_a_compiled_function_earns_the_same_as_a_called_one(driven: Racer) -> None:
@@ -232,8 +232,8 @@ def test_a_path_is_read_where_the_worlds_are_built(tmp_path: Path) -> None:
         Racer(missing, 1)
     file = tmp_path / "mine.py"
     file.write_text("def reward_function(params):\n    return None\n")
-    there = r"^config\.reward_function: .*mine\.py:1: TEST_FAILURE: the sample 'start': it returned None"
-    with pytest.raises(ValueError, match=there):
+    present = r"^config\.reward_function: .*mine\.py:1: TEST_FAILURE: the sample 'start': it returned None"
+    with pytest.raises(ValueError, match=present):
         Racer(RacerConfig(reward_function=str(file)), 1)
     with pytest.raises(ValueError, match="a reward function gets at most 10 objects, and there are 11"):
         RacerConfig(reward_function=str(file), obstacles=(ObstacleConfig(1.0),) * 11)
@@ -346,8 +346,8 @@ def test_workers_end_with_the_process_that_started_them() -> None:
         os.write(writer, f"{workers.processes[0].pid}\n".encode())
         time.sleep(600)
     os.close(writer)
-    with os.fdopen(reader) as said:
-        worker = int(said.readline())
+    with os.fdopen(reader) as answer:
+        worker = int(answer.readline())
     os.kill(child, 9)
     os.waitpid(child, 0)
     wait_for(lambda: not Path(f"/proc/{worker}").exists() or _ended(worker), 30, "the worker's end")

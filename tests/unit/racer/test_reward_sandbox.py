@@ -145,10 +145,12 @@ def test_a_function_that_a_learner_may_write_reads_and_wipes_nothing(secret: Pat
     wiping = f"import numpy as np\nbox = [np]\n{function}m.savetxt({str(secret)!r}, [])\n    return 1.0\n"
     refused = "r.py:5: FORBIDDEN: the sample 'start': {} can't be used in a reward function".format
     assert str(check_source(wiping, "r.py")) == refused("numpy.savetxt")
-    told = f"raise ValueError(str(m.fromfile({str(secret)!r}, dtype='S19')))\n"
-    assert str(check_source(f"import numpy as np\nbox = [np]\n{function}{told}", "r.py")) == refused("numpy.fromfile")
-    told = f"raise ValueError('|'.join(m.ma.core.inspect.linecache.getlines({str(secret)!r})) or 'nothing')\n"
-    assert str(check_source(f"import numpy as np\nbox = [np]\n{function}{told}", "r.py")) == refused("inspect")
+    message = f"raise ValueError(str(m.fromfile({str(secret)!r}, dtype='S19')))\n"
+    assert str(check_source(f"import numpy as np\nbox = [np]\n{function}{message}", "r.py")) == refused(
+        "numpy.fromfile"
+    )
+    message = f"raise ValueError('|'.join(m.ma.core.inspect.linecache.getlines({str(secret)!r})) or 'nothing')\n"
+    assert str(check_source(f"import numpy as np\nbox = [np]\n{function}{message}", "r.py")) == refused("inspect")
     assert secret.read_text() == SECRET
 
 

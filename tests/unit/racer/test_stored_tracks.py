@@ -54,8 +54,8 @@ def test_a_track_that_was_altered_is_not_read(store: Store) -> None:
     path = tracks.add(store, "hills", b"rows", {}).path
     (path / "track.npy").chmod(0o644)
     (path / "track.npy").write_bytes(b"ROWS")
-    said = r"track hills is damaged: .* track.npy was altered .*; delete .*hills and make or import it again"
-    with pytest.raises(TrackError, match=said):
+    output = r"track hills is damaged: .* track.npy was altered .*; delete .*hills and make or import it again"
+    with pytest.raises(TrackError, match=output):
         tracks.find(store, "hills").read()
     (path / "manifest.json").unlink()
     with pytest.raises(TrackError, match=r"track hills is damaged: .* manifest.json is missing"):

@@ -106,7 +106,7 @@ def test_a_drawn_track_has_the_requested_measures() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "words"),
+    ("measures", "words"),
     [
         ({"length": 3.0}, "length 3 m: expected 4 to 1000 m"),
         ({"length": math.nan}, "length nan m: expected 4"),
@@ -120,8 +120,8 @@ def test_a_drawn_track_has_the_requested_measures() -> None:
         ({"length": 8.0, "roughness": 1.0}, "seed 1: none of 200 curves fits"),
     ],
 )
-def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(asked: dict[str, object], words: str) -> None:
-    assert words in refusal(make_random, 1, error=BadTrack, **asked)
+def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(measures: dict[str, object], words: str) -> None:
+    assert words in refusal(make_random, 1, error=BadTrack, **measures)
 
 
 def test_a_preset_that_is_too_short_for_its_width_says_how_wide_it_may_be() -> None:
@@ -194,10 +194,10 @@ def test_the_arrays_of_a_track_are_its_own_and_can_not_be_written() -> None:
 
 def test_every_preset_can_be_driven_both_ways() -> None:
     for preset in PRESETS:
-        there, back = make_preset(preset), make_preset(preset, direction=CLOCKWISE)
-        assert (there.direction, back.direction) == (COUNTER_CLOCKWISE, CLOCKWISE)
-        np.testing.assert_array_equal(there.center[0], back.center[0])
-        np.testing.assert_array_equal(there.inner[1:], back.inner[:0:-1])
+        present, back = make_preset(preset), make_preset(preset, direction=CLOCKWISE)
+        assert (present.direction, back.direction) == (COUNTER_CLOCKWISE, CLOCKWISE)
+        np.testing.assert_array_equal(present.center[0], back.center[0])
+        np.testing.assert_array_equal(present.inner[1:], back.inner[:0:-1])
 
 
 @pytest.fixture
@@ -285,8 +285,8 @@ def test_swapped_borders_are_taken_the_right_way_whatever_the_direction(directio
     track = make_preset("oval", direction=direction)
     found = from_bytes(saved(track.rows()[:, [0, 1, 4, 5, 2, 3]]), "oval")
     assert found.track.digest == track.digest
-    said = "the borders were swapped (columns 2 and 3 lie outside the centre line): taken the right way"
-    assert found.notes == (said,)
+    output = "the borders were swapped (columns 2 and 3 lie outside the centre line): taken the right way"
+    assert found.notes == (output,)
 
 
 def test_borders_that_are_swapped_only_here_and_there_are_refused() -> None:
@@ -331,8 +331,8 @@ def spoilt(row: int, column: int, value: float) -> bytes:
 def test_a_file_other_than_a_track_is_refused_in_one_line(tmp_path: Path, data: bytes, words: str) -> None:
     path = tmp_path / "track.npy"
     path.write_bytes(data)
-    told = refusal(read_file, path, "track", error=BadTrack)
-    assert told.startswith(f"{path}: ") and words in told
+    message = refusal(read_file, path, "track", error=BadTrack)
+    assert message.startswith(f"{path}: ") and words in message
 
 
 def test_an_irregular_file_is_refused(tmp_path: Path) -> None:
