@@ -19,9 +19,9 @@ import uvicorn
 
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
-from orchestrator.api.http.auth import is_loopback
 from orchestrator.api.http.connections import Connection, Connections, Seldom, Serving, raise_descriptor_limit
 from orchestrator.api.http.limits import RATE, RateLimit
+from orchestrator.api.http.request_head import is_loopback
 from orchestrator.console import add_console
 from orchestrator.control.account import recognise as recognise_account
 from orchestrator.control.bus import Bus
@@ -39,7 +39,7 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.gangs import running_gangs
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.secrets import Secrets, SecretsError
-from orchestrator.home import HomeLock
+from orchestrator.home import HomeLock, open_socket
 from orchestrator.persistence.access_keys import KeyStore
 from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.home_files import move_in
@@ -120,8 +120,11 @@ class Server:
         with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
             self._lock = _take_lock(home, temporary)
             stack.callback(self._lock.release)
-            self._socket = _listen(host, port)
-            stack.callback(self._socket.close)
+            self._sockets = [_listen(host, port)]
+            stack.callback(self._sockets[0].close)
+            if (local := open_socket(home)) is not None:
+                self._sockets.append(local)
+                stack.callback(local.close)
             nodes = _make_engines(
                 engines, Setting(home, cpus, gpus, squeue_interval)
             )  # before anything is made in the home directory
@@ -172,7 +175,7 @@ class Server:
             self.evaluations = AutomaticEvaluations(self.controller, self.access.actor_named)
             stack.callback(self.evaluations.close)
             _name_lost_gangs(home, found)
-            bound = self._socket.getsockname()[1]
+            bound = self._sockets[0].getsockname()[1]
             self.url = (
                 f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
             )
@@ -203,7 +206,7 @@ class Server:
         logging.getLogger("asyncio").addFilter(_NO_DESCRIPTOR)
         self._uvicorn = Serving(config)
         self._thread = threading.Thread(
-            target=self._uvicorn.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True
+            target=self._uvicorn.run, kwargs={"sockets": self._sockets}, name="http", daemon=True
         )
 
     def start(self) -> None:

@@ -137,13 +137,14 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.peer = self.client[0] if self.client else ""
-        if self.client and self.server and self.server[1] is not None:
-            caller = Caller(self.client, (self.server[0], self.server[1]))
-            self.app_state = {**self.app_state, "caller": caller}  # in the state of each of its requests
+        connection = transport.get_extra_info("socket")
+        is_local = connection.family == socket.AF_UNIX
+        caller = Caller.of_unix_socket(connection) if is_local else Caller(self.client, self.server)  # type: ignore[arg-type]
+        self.app_state = {**self.app_state, "caller": caller}  # in the state of each of its requests
         if not self._connections.admit(self):
             self._refuse()
             return
-        if (connection := transport.get_extra_info("socket")) is not None and connection.family != socket.AF_UNIX:
+        if not is_local:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
         self._look()
 

@@ -157,12 +157,19 @@ class RateLimit:
             return None
         return f"Too Many Requests: {address} sends more than {FAILURES} requests per second with a wrong token or key"
 
+    def fails_too_often(self, address: str) -> bool:
+        """Whether :meth:`refusal_of_failures` would have a reason now; counts nothing."""
+        return self._tokens((address, "failures"), FAILURES, time.monotonic()) < 1
+
+    def _tokens(self, bucket: tuple[str, str], rate: int, now: float) -> float:
+        tokens, counted = self._buckets.get(bucket, (2.0 * rate, now))
+        return min(2.0 * rate, tokens + (now - counted) * rate)
+
     def _take(self, bucket: tuple[str, str], rate: int) -> bool:
         if rate <= 0:
             return True
         now = time.monotonic()
-        tokens, counted = self._buckets.get(bucket, (2.0 * rate, now))
-        tokens = min(2.0 * rate, tokens + (now - counted) * rate)
+        tokens = self._tokens(bucket, rate, now)
         allowed = tokens >= 1
         self._buckets[bucket] = (tokens - 1 if allowed else tokens, now)
         if now - self._swept > _SWEEP:
