@@ -234,7 +234,7 @@ class AutomaticEvaluations:
             actor = self._actor_named(training.owner)
             if actor is None:
                 raise ClientError(f"{training.owner}, which submitted the training, has no access any more")
-            place = place_of(training.queue, None, wanted_of(inherited(actor, training.spec)) or training.wanted)
+            place = place_of(training.queue, wanted_of(inherited(actor, training.spec)) or training.wanted)
             spec = automatic_evaluation(run.name, training.spec, place, training.wanted, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
@@ -247,7 +247,7 @@ class AutomaticEvaluations:
                     return job
 
             job = commit_submission(controller, call)
-        except (ClientError, SpecError) as error:
+        except ClientError as error:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)
             self._note(training, counted, f"checkpoint {chosen.name} was not evaluated: {error}")

@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
@@ -37,7 +37,7 @@ from shared_store.contract.error_text import Refused, shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.volume.initial_weights import NewRun, RunExists, TeacherCopy
 from shared_store.volume.layout import Run
-from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.volume.run_settings import changed_setting, merged
 
 
 def clone(
@@ -174,11 +174,8 @@ def _changed(session: Session, actor: Actor, source: FoundRun, name: str, change
     named = next((each for each in changes.assignments if each.partition("=")[0] == "name"), None)
     if named is not None:
         raise ClientError(f"--set {named[:100]}: a clone has the name that --name gives it")
-    try:
-        before = validate(document, f"run {source.name}", merged=False)
-        spec = validate(override(document, [*changes.all(), f"name={json.dumps(name)}"]), f"clone of run {source.name}")
-    except SpecError as error:
-        raise ClientError(str(error)) from None
+    before = validate(document, f"run {source.name}", merged=False)
+    spec = validate(override(document, [*changes.all(), f"name={json.dumps(name)}"]), f"clone of run {source.name}")
     for which in (before, spec):
         if which.train is None:
             what = f"run {source.name} is" if which is before else "the changes make it"
@@ -215,18 +212,16 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
             )
         return  # whether a class of the user's own reads them, or is read, only the rank can say
     settings, given = manifest["settings"], spec.train.given()
-    fixed = fixed_settings(ALGORITHMS.get(name), settings, of_clone=True)
-    asked = [key for key in fixed if setting_at(given, key) is not None]
-    if difference := first_difference(settings, given, asked):
-        key, there, here = innermost(*difference)
+    if changed := changed_setting(ALGORITHMS.get(name), settings, merged(settings, given), settings, of_clone=True):
+        key, old, new, _ = changed
         raise ClientError(
-            f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(here)}; leave the setting out"
+            f"{where} was trained with train.{name}.{key} {shown(old)}, which can't become {shown(new)}; leave the setting out"
         )
     if name in ALGORITHMS and (misfit := _of_other_size(manifest, spec.train)):
         key, there, here = misfit
         raise ClientError(
-            f"{where} was learnt with train.config.{key}: {there}, and the clone would have {here}, for which its network has another "
-            "size; leave the setting as it is, or submit a new training"
+            f"{where} was trained with train.config.{key}: {there}; with {here}, as in the clone, its network has another size: "
+            "leave the setting as it is, or submit a new training"
         )
 
 

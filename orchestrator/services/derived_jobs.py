@@ -7,7 +7,7 @@ from typing import Any
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import Job
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
@@ -62,9 +62,4 @@ def _trained(controller: Controller, actor: Actor, run: Run) -> Mapping[str, Any
 
 
 def _submitted(controller: Controller, actor: Actor, document: Mapping[str, Any], directory: str, what: str) -> Job:
-    try:
-        spec = validate(dict(document), what)
-    except SpecError as error:
-        raise ClientError(str(error)) from None
-    job, _ = submit_spec(controller, actor, spec, directory, what)
-    return job
+    return submit_spec(controller, actor, validate(dict(document), what), directory, what)[0]

@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.snapshot import fit_in_queue
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.scheduling.fit import Fit
@@ -50,10 +50,10 @@ def _problem_of_evaluations(
         wanted = wanted_of(gang.spec)
         if wanted is None:
             return None
-        place = place_of(queue.name, None, wanted)
+        place = place_of(queue.name, wanted)
         spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
         definition = compile_definition(spec, gang.options.directory)
         shape = gang_needs(definition["nodeProperties"]).shape
         return fit_in_queue(session, controller.engines, named_queue(session, actor, place["queue"]), shape).problem
-    except (ClientError, SpecError) as error:
+    except ClientError as error:
         return str(error)

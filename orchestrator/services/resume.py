@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import FoundRun
 from orchestrator.services import submission
@@ -32,7 +32,7 @@ from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, Newer
 from shared_store.volume.contents import is_archived
 from shared_store.volume.initial_weights import TeacherCopy
 from shared_store.volume.layout import Run
-from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.volume.run_settings import changed_setting, changed_task, setting_at
 
 _RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": ("algorithm.learning_rate", "")}
 """Of each algorithm that adapts a learning rate: which setting is the first one, and what else helps who wants it back."""
@@ -76,7 +76,7 @@ def _resume(
         if earlier := _answered(Context(session, controller, actor, idempotency_key), record, found, checkpoints):
             return earlier
         document = spec_of(session, actor, found)
-    with suppress(SpecError, ClientError):  # refused below, with its reason
+    with suppress(ClientError):  # refused below, with its reason
         document = override(document or {}, changes.all())
     keep_again(controller, actor, run, document)
     chosen = choose(run, changes.checkpoint)
@@ -100,13 +100,10 @@ def _resume(
                     f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
                 )
             document = inherited(actor, document)
-            try:
-                before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
-                changed = override(document, changes.all())
-                _check_algorithm(run, before, changed)
-                spec = validate(changed, f"run {run.name}")
-            except SpecError as error:
-                raise ClientError(str(error)) from None
+            before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
+            changed = override(document, changes.all())
+            _check_algorithm(run, before, changed)
+            spec = validate(changed, f"run {run.name}")
             _check_changes(run, before, spec)
             environment = {"MUSTER_RUN": run.name}
             if spec.train:
@@ -159,22 +156,15 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         if before.kind != after.kind:
             raise ClientError(f"run {run.name} is a {before.kind} job; it can't continue as {after.kind}")
         return
-    may_change = getattr(task_config(after.train.task), "may_change", ())
-    was, wanted = (
-        {**dict(train), "config": {key: value for key, value in (train.config or {}).items() if key not in may_change}}
-        for train in (before.train, after.train)
-    )
-    if difference := first_difference(was, wanted, ("task", "algorithm", "seed", "config")):
-        key, old, new = innermost(*difference)
+    if difference := changed_task(task_config(after.train.task), dict(before.train), dict(after.train)):
+        key, old, new = difference
         raise ClientError(
             f"run {run.name}: train.{key} is {_shown(old)} and can't become {_shown(new)}; start a new run for that: "
             f"muster clone {run.name} --name NEW begins one with its weights"
         )
     name = after.train.algorithm
-    kind = ALGORITHMS.get(name)
-    if difference := first_difference(before.train.given(), after.train.given(), fixed_settings(kind)):
-        may = difference[0] not in fixed_settings(kind, of_clone=True)
-        key, *values = innermost(*difference)
+    if changed := changed_setting(ALGORITHMS.get(name), before.train.given(), after.train.given()):
+        key, *values, may = changed
         old, new = ("not set" if value is None else shown(value) for value in values)
         raise ClientError(
             f"run {run.name}: train.{name}.{key} is {old} and can't become {new}: it is part of what the run has learnt; "

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import queue_engines
 from orchestrator.domain import reasons
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.gang_checks import CheckedGang
 from orchestrator.domain.identifiers import SHARE
@@ -233,13 +233,10 @@ def _row(context: Context, wanted: Submission) -> Job:
 
 def _check_automatic(context: Context, wanted: Submission) -> None:
     """Raise ClientError where the actor could not submit the evaluations of this training."""
-    try:
-        evaluation = wanted_of(wanted.gang.spec)
-    except SpecError as error:
-        raise ClientError(str(error)) from None
+    evaluation = wanted_of(wanted.gang.spec)
     if evaluation is None:
         return
-    place = place_of(wanted.queue.name, wanted.share, evaluation)
+    place = place_of(wanted.queue.name, evaluation, wanted.share)
     try:
         open_queue(context, context.queue(place["queue"]), place.get("share"))
     except permissions.Refusal:

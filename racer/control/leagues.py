@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from orchestrator.api.http.callers import user_name
 from orchestrator.control.controller import Controller
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
 from orchestrator.persistence.queries import find_job, unknown_job
@@ -307,10 +307,7 @@ def _submit(
     _checked(controller, league, model)
     facts = model.facts()
     queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
-    try:
-        spec = race_job(league, model.reference, facts, queue)
-    except SpecError as error:
-        raise ClientError(str(error)) from None
+    spec = race_job(league, model.reference, facts, queue)
     job, _ = submit_spec(
         controller,
         actor,

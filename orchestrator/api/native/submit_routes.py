@@ -8,7 +8,6 @@ from fastapi import APIRouter, Header, Request
 from pydantic import BaseModel, Field
 
 from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
-from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services.permissions import Operation
 from orchestrator.services.spec_submission import submit_spec
 from orchestrator.services.submission import answer
@@ -37,10 +36,7 @@ def submit_job(
     """
     controller, actor = controller_of(request), actor_of(request)
     actor.check(Operation.SUBMIT_SPEC)
-    try:
-        spec = from_document(body.spec, "spec")
-    except SpecError as error:
-        raise ClientError(str(error)) from None
+    spec = from_document(body.spec, "spec")
     job, _ = submit_spec(
         controller,
         actor,
