@@ -7,6 +7,7 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api.batch import fargate, validation
+from orchestrator.api.batch.checks import check_name, check_range, check_tags
 from orchestrator.api.batch.descriptions import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page, page_size
 from orchestrator.domain.errors import ClientError
@@ -23,10 +24,10 @@ _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 def register_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """RegisterJobDefinition; each registration of a name is a new revision."""
     name, kind = request["jobDefinitionName"], request["type"]
-    validation.check_name("jobDefinitionName", name)
+    check_name("jobDefinitionName", name)
     validation.check_tries(request)
-    validation.check_tags(request.get("tags") or {})
-    validation.check_priority("schedulingPriority", request.get("schedulingPriority"))
+    check_tags(request.get("tags") or {})
+    check_range("schedulingPriority", request.get("schedulingPriority"), 0, 9999)
     wanted = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
     if wanted is None:
         raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from orchestrator.api.batch.checks import check_choice, check_range
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import FARGATE_MEMBERS
 
@@ -71,10 +72,10 @@ def _check_values(container: Mapping[str, Any], where: str) -> None:
     if system != "LINUX":
         raise ClientError(f"{where}: operatingSystemFamily {system[:50]!r} is not supported: nodes run LINUX")
     for member, key, known in _VALUES:
-        if (value := (container.get(member) or {}).get(key)) and value not in known:
-            raise ClientError(f"{where}: {member} {key} is {value[:50]!r}; it is {' or '.join(known)}")
-    if (size := (container.get("ephemeralStorage") or {}).get("sizeInGiB")) is not None and not 21 <= size <= 200:
-        raise ClientError(f"{where}: ephemeralStorage sizeInGiB is {size}; it must be 21 to 200")
+        if value := (container.get(member) or {}).get(key):
+            check_choice(f"{where}: {member} {key}", value, *known)
+    size = (container.get("ephemeralStorage") or {}).get("sizeInGiB")
+    check_range(f"{where}: ephemeralStorage sizeInGiB", size, 21, 200)
 
 
 def _check_on_fargate(container: Mapping[str, Any], where: str) -> None:

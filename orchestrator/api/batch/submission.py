@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from orchestrator.api.batch import fargate, validation
+from orchestrator.api.batch.checks import check_name, check_tags
 from orchestrator.api.batch.members import check_consumables
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.domain.errors import ClientError
@@ -28,9 +29,9 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 def _submission(context: Context, request: Mapping[str, Any]) -> Submission:
     """The request as it is meant. Raises ClientError."""
-    validation.check_name("jobName", request["jobName"])
+    check_name("jobName", request["jobName"])
     validation.check_tries(request)
-    validation.check_tags(request.get("tags") or {})
+    check_tags(request.get("tags") or {})
     queue, override = context.queue(request["jobQueue"]), request.get("schedulingPriorityOverride")
     try:
         share = open_queue(context, queue, request.get("shareIdentifier"), override)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.api.batch import validation
+from orchestrator.api.batch.checks import check_tags
 from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
@@ -24,7 +24,7 @@ def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """Add tags, or replace their values."""
     resource = _resource(context, request["resourceArn"], Operation.TAG_RESOURCE)
     tags = {**resource.tags, **request["tags"]}
-    validation.check_tags(tags)
+    check_tags(tags)
     check_engine_tags(context, resource, tags)
     resource.tags = tags
     return {}

@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
+from orchestrator.api.batch.checks import check_range
 from orchestrator.api.batch.ecs import container_name, from_ecs, override_from_ecs
 from orchestrator.api.batch.members import check_consumables, check_members
 from orchestrator.api.http.limits import LARGEST_COMMANDS
@@ -15,43 +16,17 @@ from orchestrator.domain.gang import MOST_NODES, target_nodes
 from orchestrator.domain.gang_checks import CheckedGang, checked_gang
 from shared_store.contract.error_text import shown
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
-_MOST_NODES, _MOST_RANGES, _MOST_TAGS, _MOST_CONDITIONS = 1000, 5, 50, 5
+_MOST_NODES, _MOST_RANGES, _MOST_CONDITIONS = 1000, 5, 5
 _SHORTEST_TIMEOUT = 60
 NO_KUBERNETES = "is not supported: no engine is a Kubernetes cluster;"
-
-
-def check_name(key: str, name: str) -> None:
-    """A name as AWS takes it: letters, digits, hyphens, underscores, a letter or digit first, at most 128."""
-    if not _NAME.fullmatch(name):
-        raise ClientError(
-            f"{key} {name[:200]!r}: up to 128 letters, digits, hyphens and underscores, a letter or digit first"
-        )
-
-
-def check_tags(tags: Mapping[str, str]) -> None:
-    """At most 50 tags, keys of 1 to 128 characters that do not begin with ``aws:``, values of at most 256."""
-    if len(tags) > _MOST_TAGS:
-        raise ClientError(f"{len(tags)} tags; a resource has at most {_MOST_TAGS}")
-    for key, value in tags.items():
-        if not 1 <= len(key) <= 128 or key.lower().startswith("aws:") or len(value) > 256:
-            raise ClientError(
-                f"tag {key[:130]!r}: keys have 1 to 128 characters and don't begin with aws:, values have at most 256"
-            )
-
-
-def check_priority(key: str, value: int | None) -> None:
-    if value is not None and not 0 <= value <= 9999:
-        raise ClientError(f"{key} is {value}; it must be 0 to 9999")
 
 
 def check_tries(request: Mapping[str, Any]) -> None:
     """``retryStrategy`` and ``timeout`` of a definition or a submission."""
     retry, timeout = request.get("retryStrategy") or {}, request.get("timeout") or {}
     attempts, conditions = retry.get("attempts"), retry.get("evaluateOnExit") or []
-    if attempts is not None and not 1 <= attempts <= 10:
-        raise ClientError(f"retryStrategy attempts is {attempts}; it must be 1 to 10")
+    check_range("retryStrategy attempts", attempts, 1, 10)
     if conditions and attempts is None:
         raise ClientError("retryStrategy evaluateOnExit needs attempts too")
     if len(conditions) > _MOST_CONDITIONS:
