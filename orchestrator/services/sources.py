@@ -15,10 +15,9 @@ from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.batch_models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
+from orchestrator.services.chosen_checkpoints import check_evaluation, check_task, check_training
 from orchestrator.services.context import Context, archived, permitted_run, release
-from orchestrator.services.evaluated_checkpoints import check_evaluation, check_task
 from orchestrator.services.permissions import Operation
-from orchestrator.services.stored_names import check_training
 from shared_store.contract import plugins
 from shared_store.contract.error_text import shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints

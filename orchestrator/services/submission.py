@@ -391,3 +391,44 @@ def _numbers(numbers: range) -> ColumnElement[int]:
     step = select(first.c.number + 1).where(first.c.number < numbers.stop - 1)
     column: ColumnElement[int] = first.union_all(step).c.number
     return column
+
+
+def revision(
+    context: Context,
+    name: str,
+    document: Mapping[str, Any],
+    gang: GangSpec,
+    tags: Mapping[str, str] | None = None,
+    *,
+    again: bool = True,
+) -> JobDefinition:
+    """A revision of a definition, to be added to the session.
+
+    Args:
+        context: The call.
+        name: Of the definition.
+        document: The request of RegisterJobDefinition, without tags.
+        gang: What the document asks for.
+        tags: Of the definition.
+        again: Whether a document that is the newest revision already becomes a revision of its own, as on AWS.
+
+    Raises:
+        ClientError: The store lacks a text that the document names.
+        StoreNeeded: Something has to be read of the store first (:func:`.context.with_store`).
+    """
+    context.actor.check(Operation.REGISTER_JOB_DEFINITION)
+    check_texts(context, gang)
+    of_name = select(JobDefinition).where(JobDefinition.name == name).order_by(JobDefinition.revision.desc()).limit(1)
+    if not again:
+        own = context.session.scalars(of_name.where(JobDefinition.owner == context.actor.name)).first()
+        if own and own.status == "ACTIVE" and own.document == document and own.tags == (tags or {}):
+            return own
+    newest = context.session.scalars(of_name).first()
+    return JobDefinition(
+        name=name,
+        revision=newest.revision + 1 if newest else 1,
+        document=dict(document),
+        owner=context.actor.name,
+        status="ACTIVE",
+        tags=dict(tags or {}),
+    )

@@ -15,8 +15,8 @@ from orchestrator.persistence.batch_models import JobDefinition
 from orchestrator.services import permissions
 from orchestrator.services.arns import definition_arn, plain_name
 from orchestrator.services.context import Context
-from orchestrator.services.definitions import revision
 from orchestrator.services.permissions import Actor, Operation
+from orchestrator.services.submission import revision
 
 _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 

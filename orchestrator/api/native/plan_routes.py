@@ -22,12 +22,11 @@ from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
+from orchestrator.services.chosen_checkpoints import check_evaluation, check_task, check_training
 from orchestrator.services.context import permitted_run
-from orchestrator.services.evaluated_checkpoints import check_evaluation, check_task
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import JobsOf, Operation
 from orchestrator.services.sources import sources_of
-from orchestrator.services.stored_names import check_training
 from shared_store.contract import plugins
 
 router = APIRouter(route_class=StoreRoute)

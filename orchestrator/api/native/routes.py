@@ -24,7 +24,6 @@ from orchestrator.api.native import (
     retention_routes,
     run_routes,
     submit_routes,
-    text_routes,
     webhook_routes,
 )
 from orchestrator.api.native.log_stream import followed, positions_of, stored
@@ -56,7 +55,7 @@ router.include_router(job_list.router)
 router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
 router.include_router(retention_routes.router)
-router.include_router(text_routes.router)
+router.include_router(submit_routes.texts)
 router.include_router(model_routes.router)
 router.include_router(webhook_routes.router)
 router.include_router(key_routes.router)

@@ -11,7 +11,7 @@ from pydantic import BaseModel, Field
 from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.services import clone as clones
-from orchestrator.services import lineage, runs
+from orchestrator.services import runs
 from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Operation
 from orchestrator.services.resume import resume
@@ -79,7 +79,7 @@ def run_detail(request: Request, name: str) -> Any:
     controller, actor = controller_of(request), actor_of(request)
     run = permitted_run(controller, actor, name, Operation.READ_RUN)
     described = runs.describe_run(controller, actor, run)
-    return actor.shown({**described, "clones": lineage.clones_of(controller, actor, run)})
+    return actor.shown({**described, "clones": runs.clones_of(controller, actor, run)})
 
 
 @router.get("/runs/{name}/checkpoints")
