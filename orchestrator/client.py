@@ -177,12 +177,12 @@ class Client:
         return self.get(f"/api/jobs/{named(job)}")["status"] in TERMINAL
 
     def _stream(self, job: str, query: dict[str, Any], positions: dict[str, int]) -> Iterator[list[dict[str, Any]]]:
-        wanted = {key: value for key, value in query.items() if value is not None}
+        parameters = {key: value for key, value in query.items() if value is not None}
         if positions:
-            wanted["positions"] = json.dumps(positions)
+            parameters["positions"] = json.dumps(positions)
         try:
             with self._http.stream(
-                "GET", f"/api/jobs/{named(job)}/logs", params=wanted, timeout=httpx.Timeout(30, read=60)
+                "GET", f"/api/jobs/{named(job)}/logs", params=parameters, timeout=httpx.Timeout(30, read=60)
             ) as answer:
                 if answer.is_error:
                     answer.read()

@@ -117,7 +117,7 @@ def make_private(home: Path) -> None:
         log.warning("%s was open to other users; it is closed to them now (chmod 700)", home)
         return
     for name in _MADE_LATER:
-        with suppress(OSError):  # said by what needs it
+        with suppress(OSError):  # reported by what needs it
             (home / name).mkdir(mode=0o700, exist_ok=True)
     ours = [home / name for name in _DIRECTORIES if (home / name).is_dir() and not (home / name).is_symlink()]
     is_open = [path.name for path in ours if not _closed(path)]

@@ -277,9 +277,9 @@ def _name_lost_gangs(home: Path, database: Database) -> None:
 def _check_exposure(option: str, access: Access, database: str | None) -> None:
     """Raises ServerError where others could come in without a key."""
     if access.exposed and not access.token and not access.known():
-        there = f" (with the same --database as here: {shown(database)})" if database else ""
+        hint = f" (with the same --database as here: {shown(database)})" if database else ""
         raise ServerError(
-            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`{there}, or set "
+            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`{hint}, or set "
             "MUSTER_TOKEN to a secret, here and for the clients"
         )
 

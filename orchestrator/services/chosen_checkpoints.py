@@ -25,23 +25,23 @@ CONFLICT = 409
 """The request is well formed, but conflicts with the present state."""
 
 
-def choose(run: Run, wanted: int | Literal["best", "latest"] | None) -> Checkpoint | None:
+def choose(run: Run, requested: int | Literal["best", "latest"] | None) -> Checkpoint | None:
     """The requested checkpoint; None for the newest one of a run that has none. Raises ClientError where it does not exist."""
     checkpoints = list_checkpoints(run)
-    there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
-    if wanted in (None, "latest"):
+    available = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
+    if requested in (None, "latest"):
         return checkpoints[-1] if checkpoints else None
-    if wanted == "best":
+    if requested == "best":
         chosen = best_checkpoint(run)
         problem = (
             ": no checkpoint has a score yet, which is a mean over at least 100 episodes, and no two are evaluated; "
             "name an iteration"
         )
     else:
-        chosen = next((each for each in reversed(checkpoints) if each.iteration == wanted), None)
-        problem = f" has no checkpoint of iteration {wanted}; it has"
+        chosen = next((each for each in reversed(checkpoints) if each.iteration == requested), None)
+        problem = f" has no checkpoint of iteration {requested}; it has"
     if chosen is None:
-        raise ClientError(f"run {run.name}{problem}: {there}", 404)
+        raise ClientError(f"run {run.name}{problem}: {available}", 404)
     return chosen
 
 
@@ -76,10 +76,10 @@ def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str =
     section = spec.get(key)
     if not isinstance(section, dict):
         return None
-    wanted, changes = section.get("checkpoint"), section.get("config") or {}
-    if not (wanted in (None, "best", "latest") or isinstance(wanted, int)) or not isinstance(changes, dict):
+    requested, changes = section.get("checkpoint"), section.get("config") or {}
+    if not (requested in (None, "best", "latest") or isinstance(requested, int)) or not isinstance(changes, dict):
         return None
-    chosen = choose(run, wanted)
+    chosen = choose(run, requested)
     if chosen is None:
         raise ClientError(f"run {run.name} has no checkpoint yet; train it first", 404)
     try:

@@ -211,30 +211,30 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
                 "or with a module:Class of your own whose load_state_dict reads them"
             )
         return  # whether a class of the user's own reads them, or is read, only the rank can say
-    settings, given = manifest["settings"], spec.train.given()
-    if changed := changed_setting(ALGORITHMS.get(name), settings, merged(settings, given), settings, of_clone=True):
+    settings, own = manifest["settings"], spec.train.given()
+    if changed := changed_setting(ALGORITHMS.get(name), settings, merged(settings, own), settings, of_clone=True):
         key, old, new, _ = changed
         raise ClientError(
             f"{where} was trained with train.{name}.{key} {shown(old)}, which can't become {shown(new)}; leave the setting out"
         )
     if name in ALGORITHMS and (misfit := _of_other_size(manifest, spec.train)):
-        key, there, here = misfit
+        key, then, now = misfit
         raise ClientError(
-            f"{where} was trained with train.config.{key}: {there}; with {here}, as in the clone, its network has another size: "
+            f"{where} was trained with train.config.{key}: {then}; with {now}, as in the clone, its network has another size: "
             "leave the setting as it is, or submit a new training"
         )
 
 
 def _of_other_size(manifest: Mapping[str, Any], train: Train) -> tuple[str, str, str] | None:
-    """The first setting of an installed task for which the policy has another size than in a checkpoint: its key, there, here."""
+    """The first setting of an installed task for which the policy has another size than in a checkpoint: its key, then and now."""
     kind, learnt = task_config(train.task), manifest.get("train")
     if kind is None or not isinstance(learnt, dict) or manifest.get("task") != train.task:
         return None
     try:
-        there, here = (kind.configured(config or {}).policy_sizes for config in (learnt.get("config"), train.config))
+        then, now = (kind.configured(config or {}).policy_sizes for config in (learnt.get("config"), train.config))
     except Refused:  # of what another version has written
         return None
-    return next(((key, there[key], here[key]) for key in there if key in here and there[key] != here[key]), None)
+    return next(((key, then[key], now[key]) for key in then if key in now and then[key] != now[key]), None)
 
 
 _EXISTS = "run {} exists already: give the clone another --name"

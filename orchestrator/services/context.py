@@ -129,8 +129,8 @@ class Context:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
         queue = self.session.get(JobQueue, plain_name(reference, "job-queue"))
         if queue is None or (queue.deleting and not deleting):
-            there = ", ".join(queue_names(self.session, self.actor)[:5]) or "none yet"
-            raise ClientError(f"Job queue {reference[:300]} does not exist; there is {there}")
+            available = ", ".join(queue_names(self.session, self.actor)[:5]) or "none yet"
+            raise ClientError(f"Job queue {reference[:300]} does not exist; there is {available}")
         return queue
 
     def definition(self, reference: str) -> JobDefinition:
@@ -290,9 +290,9 @@ def visible_runs(
         among: Those of which this is true; it may read the store.
     """
     restricted = actor.queues is not None
-    wanted = search.lower()
+    part = search.lower()
     found = controller.access.store.runs(
-        after, None if restricted else most, lambda run: wanted in run.name.lower() and among(run)
+        after, None if restricted else most, lambda run: part in run.name.lower() and among(run)
     )
     if not restricted:
         return found

@@ -57,7 +57,7 @@ def _trained(controller: Controller, actor: Actor, run: Run) -> Mapping[str, Any
     with controller.database.session() as session:
         spec = spec_of(session, actor, found) or {}
     if not spec.get("train"):
-        raise ClientError(f"run {run.name} is no training, so it has no policy")
+        raise ClientError(f"run {run.name} is not a training, so it has no policy")
     return spec
 
 

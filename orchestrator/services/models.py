@@ -21,7 +21,7 @@ def register(
     actor: Actor,
     run_name: str,
     name: str,
-    wanted: int | Literal["best", "latest"] | None = None,
+    requested: int | Literal["best", "latest"] | None = None,
     *,
     again: bool = False,
 ) -> Model:
@@ -32,7 +32,7 @@ def register(
         actor: Who asks.
         run_name: The run of the checkpoint.
         name: Of the model.
-        wanted: Iteration of the checkpoint, ``best`` or ``latest``; the newest where None.
+        requested: Iteration of the checkpoint, ``best`` or ``latest``; the newest where None.
         again: Register a checkpoint that is a version of the model already.
 
     Raises:
@@ -42,16 +42,16 @@ def register(
     controller.writes.check(adds=True)
     if shortage := controller.access.shortage():
         raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
-    checkpoint = choose(run, wanted)
+    checkpoint = choose(run, requested)
     if checkpoint is None:
         raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
     record = owner_of_run(controller, run)
     queue, owner = (record.queue, record.owner) if record else ("", None)
     try:
         with using(controller, run.name):
-            there = models.versions(controller.access.store, name)
-            if there:
-                actor.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
+            existing = models.versions(controller.access.store, name)
+            if existing:
+                actor.check(Operation.REGISTER_MODEL, owner_of_model(existing[-1]))
             facts = {"queue": queue, "owner": owner, "registered_by": actor.name}
             return models.register(
                 controller.access.store, name, run, checkpoint, facts, controller.access.peers.id, again=again

@@ -183,20 +183,22 @@ def _check_rate(run: Run, chosen: Checkpoint, after: Spec, assignments: Sequence
         return
     name = after.train.algorithm
     key, hint = _RATES[name]
-    asked = setting_at(override({}, assignments), f"train.{name}.{key}")  # whatever section the assignment gives whole
-    if asked is None or (name == "ppo" and after.train.given().get("schedule") == "fixed"):
+    requested = setting_at(
+        override({}, assignments), f"train.{name}.{key}"
+    )  # whatever section the assignment gives whole
+    if requested is None or (name == "ppo" and after.train.given().get("schedule") == "fixed"):
         return
     try:
         saved = chosen.manifest
     except DamagedCheckpoint:
         return  # the worker uses the one before
     rate = saved.get("learning_rate")
-    if not isinstance(asked, int | float) or not isinstance(rate, int | float):
+    if not isinstance(requested, int | float) or not isinstance(rate, int | float):
         return
-    differs = setting_at(saved, f"train.{name}.{key}") != asked  # then it counts
-    if not differs and not math.isclose(rate, asked, rel_tol=1e-6):  # a rate may be a float32
+    differs = setting_at(saved, f"train.{name}.{key}") != requested  # then it counts
+    if not differs and not math.isclose(rate, requested, rel_tol=1e-6):  # a rate may be a float32
         raise ClientError(
-            f"run {run.name}: train.{name}.{key} is {asked!r} already, so that the run would continue with "
+            f"run {run.name}: train.{name}.{key} is {requested!r} already, so that the run would continue with "
             f"the rate of its checkpoint, which is {rate:.3g} now; set another value{hint}"
         )
 
@@ -227,15 +229,15 @@ def _worlds(session: Session, actor: Actor, run: FoundRun, before: Spec, after: 
     """Number of worlds with which the run continues: those that it has, whatever the number of ranks. Raises ClientError where they don't fit."""
     assert before.train is not None and after.train is not None
     ranks = after.nodes.max * after.ranks_per_node
-    wanted = after.train.worlds * ranks
+    total = after.train.worlds * ranks
     changed = before.train.worlds != after.train.worlds
     if changed and chosen is None:  # no checkpoint holds worlds yet
-        return wanted
+        return total
     worlds = _worlds_of(session, actor, run, before, chosen)
-    if changed and wanted != worlds:
+    if changed and total != worlds:
         assert chosen is not None
         raise ClientError(
-            f"run {run.name}: checkpoint {chosen.name} holds {counted(worlds, 'world')}, this job would have {wanted} "
+            f"run {run.name}: checkpoint {chosen.name} holds {counted(worlds, 'world')}, this job would have {total} "
             f"({counted(after.nodes.max, 'node')} × {counted(after.ranks_per_node, 'rank')} × {after.train.worlds}); "
             "leave train.worlds as it is: the worlds are distributed over all ranks"
         )
@@ -250,10 +252,10 @@ def _worlds_of(session: Session, actor: Actor, run: FoundRun, before: Spec, chos
     """Number of worlds of the run, by its checkpoint, else by its newest job's variables or spec."""
     assert before.train is not None
     try:
-        if chosen and isinstance(told := chosen.manifest.get("worlds"), int):
-            return told
+        if chosen and isinstance(saved := chosen.manifest.get("worlds"), int):
+            return saved
     except DamagedCheckpoint:
         pass
-    if (newest := newest_job(session, actor, run)) and (given := newest.gang.options.worlds) is not None:
-        return given
+    if (newest := newest_job(session, actor, run)) and (distributed := newest.gang.options.worlds) is not None:
+        return distributed
     return before.train.worlds * before.ranks_per_node * before.nodes.max

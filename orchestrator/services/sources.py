@@ -192,9 +192,9 @@ def _checkpoint(run: Run, source: SourceRun) -> Checkpoint:
         raise ClientError(f"{source.key}: run {source.run} has no checkpoint yet; train it first")
     meant = [checkpoint for checkpoint in checkpoints if _is_meant(checkpoint, source)]
     if not meant:
-        there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints)
+        available = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints)
         raise ClientError(
-            f"{source.key}: run {source.run} has no checkpoint of iteration {source.checkpoint}; it has: {there}"
+            f"{source.key}: run {source.run} has no checkpoint of iteration {source.checkpoint}; it has: {available}"
         )
     return meant[-1]
 
@@ -208,12 +208,12 @@ def _sources(node: NodeSpec) -> Iterator[SourceRun]:
         section = sections.get(kind)
         if isinstance(section, dict) and isinstance(section.get("run"), str):
             yield SourceRun(section["run"], kind)
-    given: Any = sections
+    value: Any = sections
     for part in _TEACHER.split("."):
-        given = given.get(part) if isinstance(given, dict) else None
-    if given is not None:
-        found = re.fullmatch(rf"({NAME.pattern})(?:@([0-9]{{1,8}}|[0-9]{{8}}-e[0-9]{{1,18}}))?", str(given))
+        value = value.get(part) if isinstance(value, dict) else None
+    if value is not None:
+        found = re.fullmatch(rf"({NAME.pattern})(?:@([0-9]{{1,8}}|[0-9]{{8}}-e[0-9]{{1,18}}))?", str(value))
         if found is None:
-            raise ClientError(f"{_TEACHER}: expected RUN or RUN@ITERATION, found {shown(given)}")
+            raise ClientError(f"{_TEACHER}: expected RUN or RUN@ITERATION, found {shown(value)}")
         iteration = found[2] or ""
-        yield SourceRun(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration, str(given))
+        yield SourceRun(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration, str(value))

@@ -28,14 +28,14 @@ def register_job_definition(context: Context, request: dict[str, Any]) -> dict[s
     validation.check_tries(request)
     check_tags(request.get("tags") or {})
     check_range("schedulingPriority", request.get("schedulingPriority"), 0, 9999)
-    wanted = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
-    if wanted is None:
+    allowed = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
+    if allowed is None:
         raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")
     if request.get("eksProperties"):
-        raise ClientError(f"job definition {name}: eksProperties {validation.NO_KUBERNETES} use {' or '.join(wanted)}")
-    given = [key for key in _PROPERTIES if request.get(key)]
-    if len(given) != 1 or given[0] not in wanted:
-        raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
+        raise ClientError(f"job definition {name}: eksProperties {validation.NO_KUBERNETES} use {' or '.join(allowed)}")
+    present = [key for key in _PROPERTIES if request.get(key)]
+    if len(present) != 1 or present[0] not in allowed:
+        raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(allowed)}, and only that")
     properties = validation.node_properties(request)
     gang = validation.check_nodes(properties, kind)
     fargate.check_platform(request, properties, f"job definition {name}")
@@ -51,11 +51,11 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
     listed = request.get("jobDefinitions") or []
     query = select(JobDefinition).order_by(JobDefinition.name, JobDefinition.revision.desc())
     if listed:
-        wanted = [plain_name(each, "job-definition").partition(":") for each in listed]
+        allowed = [plain_name(each, "job-definition").partition(":") for each in listed]
         found = [
             each
-            for each in context.session.scalars(query.where(JobDefinition.name.in_([name for name, _, _ in wanted])))
-            if any(each.name == name and revision in ("", str(each.revision)) for name, _, revision in wanted)
+            for each in context.session.scalars(query.where(JobDefinition.name.in_([name for name, _, _ in allowed])))
+            if any(each.name == name and revision in ("", str(each.revision)) for name, _, revision in allowed)
             and request.get("status") in (None, each.status)
         ]
         return {"jobDefinitions": [_describe(context.actor, each) for each in found]}

@@ -88,11 +88,11 @@ def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict
 
 def _waits(context: Context, request: Mapping[str, Any], size: int | None) -> Sequence[Wait]:
     """``dependsOn``, checked; ``size`` of the array that waits, None for another job."""
-    wanted = request.get("dependsOn") or []
-    if len(wanted) > _MOST_DEPENDENCIES:
-        raise ClientError(f"dependsOn has {len(wanted)} entries; at most {_MOST_DEPENDENCIES}")
+    dependencies = request.get("dependsOn") or []
+    if len(dependencies) > _MOST_DEPENDENCIES:
+        raise ClientError(f"dependsOn has {len(dependencies)} entries; at most {_MOST_DEPENDENCIES}")
     found: dict[str, Wait] = {}
-    for entry in wanted:
+    for entry in dependencies:
         kind, reference = entry.get("type"), entry.get("jobId")
         if kind not in (None, "N_TO_N", "SEQUENTIAL"):
             raise ClientError(f"dependsOn type is {kind[:50]!r}; it is N_TO_N or SEQUENTIAL")

@@ -41,14 +41,14 @@ def check_tries(request: Mapping[str, Any]) -> None:
 def _check_condition(condition: Mapping[str, str]) -> None:
     if condition["action"].upper() not in ("RETRY", "EXIT"):
         raise ClientError(f"retryStrategy evaluateOnExit action is {condition['action'][:50]!r}; it is RETRY or EXIT")
-    given = {key: condition[key] for key in ("onExitCode", "onReason", "onStatusReason") if condition.get(key)}
-    if not given:
+    present = {key: condition[key] for key in ("onExitCode", "onReason", "onStatusReason") if condition.get(key)}
+    if not present:
         raise ClientError("retryStrategy evaluateOnExit: an entry needs onExitCode, onReason or onStatusReason")
-    for key, pattern in given.items():
+    for key, pattern in present.items():
         if len(pattern) > 512 or "*" in pattern[:-1]:
             raise ClientError(f"{key} {pattern[:50]!r}: at most 512 characters, with a * at the end only")
-    if not re.fullmatch(r"[0-9]*\*?", given.get("onExitCode", "*")):
-        raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
+    if not re.fullmatch(r"[0-9]*\*?", present.get("onExitCode", "*")):
+        raise ClientError(f"onExitCode {present['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
 def check_nodes(properties: Mapping[str, Any], kind: str) -> CheckedGang:
@@ -157,14 +157,14 @@ def _where(entry: Mapping[str, Any], kind: str) -> str:
 
 
 def _in_container(entry: Mapping[str, Any], where: str) -> dict[str, Any]:
-    given = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
-    if "eksProperties" in given:
+    present = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
+    if "eksProperties" in present:
         raise ClientError(f"{where}: eksProperties {NO_KUBERNETES} use container or ecsProperties")
-    if given not in (["container"], ["ecsProperties"]):
+    if present not in (["container"], ["ecsProperties"]):
         raise ClientError(f"{where}: give container or ecsProperties, and only one of them")
     check_consumables(entry, where)
     rest = {key: value for key, value in entry.items() if key not in ("container", "ecsProperties")}
-    if given == ["container"]:
+    if present == ["container"]:
         return {**rest, "container": dict(entry["container"])}
     ecs = entry["ecsProperties"]
     return {**rest, "container": from_ecs(ecs, where), "ecs": container_name(ecs)}

@@ -34,7 +34,7 @@ _PIECE = 16 << 10
 """Bytes that are parsed at once. A head of more than h11's limit (64 KiB) and one piece is always refused."""
 _MOST_DESCRIPTORS = 65_536
 _MOST_CONNECTIONS = 4096
-_SAID = 60.0
+_QUIET = 60.0
 """Seconds between two lines about the same trouble."""
 
 log = logging.getLogger("muster.api")
@@ -43,10 +43,10 @@ log = logging.getLogger("muster.api")
 def raise_descriptor_limit() -> int:
     """Raise this process's limit of open files as far as it may, at most to 65,536; returns the limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _MOST_DESCRIPTORS)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-        return wanted
+    target = _MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _MOST_DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < target:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
+        return target
     return _MOST_DESCRIPTORS if soft == resource.RLIM_INFINITY else soft
 
 
@@ -65,7 +65,7 @@ class Connections:
         self._peers: dict[str, int] = {}
         self._waiting: dict[str, dict[Connection, None]] = {}
         """By peer, the longest first: those whose request is not complete, or whose answer is not read."""
-        self._count, self._said = 0, -_SAID
+        self._count, self._logged = 0, -_QUIET
 
     def admit(self, connection: Connection) -> bool:
         """Count a new connection; where there are too many, another gives way. False where none can."""
@@ -79,10 +79,10 @@ class Connections:
         else:
             self._add(connection)
             return True
-        if time.monotonic() - self._said > _SAID:
-            self._said = time.monotonic()
+        if time.monotonic() - self._logged > _QUIET:
+            self._logged = time.monotonic()
             log.warning(
-                "%d connections are open, %d of them from %s; those that have waited longest for their client are closed",
+                "%d connections are open, %d of them from %s; those that have waited for their client longest are closed first",
                 *(self._count, self._peers.get(peer, 0), peer),
             )
         if victim is None:
@@ -241,7 +241,7 @@ class Connection(H11Protocol):
         self._close()
 
     def _should_upgrade(self) -> bool:
-        return False  # there is no websocket here, and uvicorn would log each attempt
+        return False  # the server takes no websockets, and uvicorn would log each attempt
 
 
 class Serving(uvicorn.Server):
@@ -258,16 +258,16 @@ class Seldom(logging.Filter):
 
     def __init__(self, *messages: str) -> None:
         super().__init__()
-        self._said = dict.fromkeys(messages, -_SAID)
+        self._logged = dict.fromkeys(messages, -_QUIET)
 
     def filter(self, record: logging.LogRecord) -> bool:
-        message = next((each for each in self._said if each in str(record.msg)), None)
+        message = next((each for each in self._logged if each in str(record.msg)), None)
         if message is None:
             return True
         record.exc_info = record.exc_text = None
         record.msg, record.args = str(record.msg).splitlines()[0], ()
         now = time.monotonic()
-        if now - self._said[message] < _SAID:
+        if now - self._logged[message] < _QUIET:
             return False
-        self._said[message] = now
+        self._logged[message] = now
         return True

@@ -40,10 +40,10 @@ _STREAM = re.compile(r"[^:*\0]{1,512}")
 
 def named_by(session: Session, request: dict[str, Any]) -> str:
     """Name of the group in ``logGroupName`` or ``logGroupIdentifier``. Raises LogsError where it does not exist."""
-    given = [request[key] for key in ("logGroupName", "logGroupIdentifier") if key in request]
-    if len(given) != 1:
+    named = [request[key] for key in ("logGroupName", "logGroupIdentifier") if key in request]
+    if len(named) != 1:
         raise invalid("Exactly one of logGroupName and logGroupIdentifier is needed.")
-    return existing(session, given[0])
+    return existing(session, named[0])
 
 
 def existing(session: Session, reference: str) -> str:

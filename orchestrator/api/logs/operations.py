@@ -130,16 +130,16 @@ def get_log_events(controller: Controller, actor: Actor, request: dict[str, Any]
     view = stream.file.look()
     since, before = request.get("startTime", 0), request.get("endTime")
     limit = request.get("limit", _MOST_EVENTS)
-    token = _STREAM_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
-    if given and not token:
+    token = _STREAM_TOKEN.fullmatch(sent) if (sent := request.get("nextToken")) else None
+    if sent and not token:
         raise invalid("The specified nextToken is invalid.")
     forward = token[1] == "f" if token else request.get("startFromHead", False)
     if forward:
         here = int(token[2]) if token else 0
-        told = [view.replaced()] if here > view.end else []
-        here = 0 if told else here
+        notices = [view.replaced()] if here > view.end else []
+        here = 0 if notices else here
         found = _until(view.forward(since, here), lambda event: before is not None and event.time >= before)
-        page = _page(chain(told, found), limit)
+        page = _page(chain(notices, found), limit)
     else:
         here = int(token[2]) if token else view.end
         page = _page(_until(view.backward(before, here), lambda event: event.time < since), limit)[::-1]
@@ -157,8 +157,8 @@ def filter_log_events(controller: Controller, actor: Actor, request: dict[str, A
     """
     newest = now() - SETTLE  # before anything is looked at
     matches = _pattern(request.get("filterPattern", ""))
-    token = _SEARCH_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
-    if given and not token:
+    token = _SEARCH_TOKEN.fullmatch(sent) if (sent := request.get("nextToken")) else None
+    if sent and not token:
         raise invalid("The specified nextToken is invalid.")
     ascending = token[1] == "f" if token else request.get("startFromHead", True)
     since, before = request.get("startTime", 0), request.get("endTime", 10**14) + 1  # inclusive here, as AWS has it
@@ -205,8 +205,8 @@ def describe_log_streams(controller: Controller, actor: Actor, request: dict[str
     prefix = request.get("logStreamNamePrefix", "")
     if by_time and prefix:
         raise invalid("Cannot order by LastEventTime with a logStreamNamePrefix.")
-    token = _LIST_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
-    if given and not token:
+    token = _LIST_TOKEN.fullmatch(sent) if (sent := request.get("nextToken")) else None
+    if sent and not token:
         raise invalid("The specified nextToken is invalid.")
     with controller.database.session() as session:
         group = groups.named_by(session, request)
@@ -260,15 +260,15 @@ def start_live_tail(controller: Controller, actor: Actor, ending: threading.Even
     if (names or prefixes) and len(tailed) > 1:
         raise invalid("logStreamNames and logStreamNamePrefixes need exactly one log group in logGroupIdentifiers.")
     matches = _pattern(request.get("logEventFilterPattern", ""))
-    wanted = set(names or ())
+    chosen = set(names or ())
 
-    def asked_for(name: str) -> bool:
-        return name in wanted if names else not prefixes or name.startswith(tuple(prefixes))
+    def accepts(name: str) -> bool:
+        return name in chosen if names else not prefixes or name.startswith(tuple(prefixes))
 
     start = {"logGroupIdentifiers": [log_group_arn(name) for name in tailed]}
     start |= {"logEventFilterPattern": request.get("logEventFilterPattern", "")}
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
-    tail = LiveTail(controller, actor, tailed, asked_for, matches)
+    tail = LiveTail(controller, actor, tailed, accepts, matches)
     return _Session(tail, messages(tail, start, here().id, ending))
 
 

@@ -81,7 +81,7 @@ def _jobs_of_run(session: Session, actor: Actor, reference: str) -> str:
         return ""
     names = ", ".join(named(job.name, job.id) for job in made[-5:])
     which = "job" if len(made) == 1 else "jobs"
-    return f"{reference} is a run, which {which} {names} made; see: muster show {short_id(made[-1].id)}"
+    return f"{reference} is a run (created by {which} {names}); try: muster show {short_id(made[-1].id)}"
 
 
 @router.get("/capacity")
@@ -222,7 +222,7 @@ def job_logs(
             count = len(job.gang.nodes)
         if node is not None and not 0 <= node < count:
             raise ClientError(
-                f"job {named(job.name, job.id)} has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
+                f"job {named(job.name, job.id)} has no node {str(node)[:20]}: it is out of range (0-{count - 1})", 404
             )
         chosen = Chosen(controller.access.store.run(job.run), job.id, node, rank, attempt)
     view, calls = LogView(chosen, positions_of(positions), PIECE), controller.access.followed

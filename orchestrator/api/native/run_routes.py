@@ -67,8 +67,8 @@ def list_runs(
     controller, actor = controller_of(request), actor_of(request)
     found = runs.list_runs(controller, actor, after, most, search, archived)
     if len(found) == most:
-        asked = {**({"search": search} if search else {}), **({"archived": "true"} if archived else {})}
-        query = urlencode({"max": most, "after": found[-1]["run"], **asked})
+        filters = {**({"search": search} if search else {}), **({"archived": "true"} if archived else {})}
+        query = urlencode({"max": most, "after": found[-1]["run"], **filters})
         response.headers["Link"] = f'</api/runs?{query}>; rel="next"'
     return actor.shown(found)
 
@@ -101,8 +101,8 @@ def _evaluated(summary: dict[str, Any] | None) -> dict[str, Any] | None:
     """The result of a checkpoint in the worlds of its training: ``mean``, ``low``, ``high`` of the return, ``episodes``."""
     if summary is None:
         return None
-    told = summary.get("return")
-    interval = told if isinstance(told, dict) else {}
+    returned = summary.get("return")
+    interval = returned if isinstance(returned, dict) else {}
     ends = {end: interval.get(end) for end in ("low", "high")}
     return {"mean": summary["mean_return"], **ends, "episodes": summary["episodes"], "name": summary["name"]}
 
