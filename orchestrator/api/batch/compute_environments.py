@@ -13,7 +13,7 @@ from sqlalchemy import select
 from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.checks import check_choice, check_name, check_range, check_tags
 from orchestrator.api.batch.engine_tags import check_engine_tags
-from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.batch.paging import page
 from orchestrator.control.compute_environments import is_built_in
 from orchestrator.domain.errors import ClientError
 from orchestrator.engines.registry import FRESH
@@ -56,7 +56,7 @@ def describe_compute_environments(context: Context, request: dict[str, Any]) -> 
     query = select(ComputeEnvironment).order_by(ComputeEnvironment.name)
     if named := request.get("computeEnvironments"):
         query = query.where(ComputeEnvironment.name.in_([plain_name(each, "compute-environment") for each in named]))
-    rows, token = page(context.session, query, request, page_size(request, 100), (ComputeEnvironment.name,), (False,))
+    rows, token = page(context.session, query, request, ComputeEnvironment.name)
     return {"computeEnvironments": [_describe(context, compute_environment) for compute_environment in rows], **token}
 
 
@@ -143,7 +143,7 @@ def describe_scheduling_policies(context: Context, request: dict[str, Any]) -> d
 def list_scheduling_policies(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """ListSchedulingPolicies."""
     query = select(SchedulingPolicy).order_by(SchedulingPolicy.name)
-    rows, token = page(context.session, query, request, page_size(request, 100), (SchedulingPolicy.name,), (False,))
+    rows, token = page(context.session, query, request, SchedulingPolicy.name)
     return {"schedulingPolicies": [{"arn": policy_arn(policy.name)} for policy in rows], **token}
 
 

@@ -9,7 +9,7 @@ from sqlalchemy import select
 from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.checks import check_name, check_range, check_tags
 from orchestrator.api.batch.descriptions import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
-from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.batch.paging import page
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import JobDefinition
 from orchestrator.services import permissions
@@ -63,9 +63,8 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
         query = query.where(JobDefinition.name == plain_name(name, "job-definition").partition(":")[0])
     if status := request.get("status"):
         query = query.where(JobDefinition.status == status)
-    found_page, token = page(
-        context.session, query, request, page_size(request, 100), (JobDefinition.name, JobDefinition.revision)
-    )
+    keys = JobDefinition.name, JobDefinition.revision
+    found_page, token = page(context.session, query, request, *keys, descending=(False, True))
     return {"jobDefinitions": [_describe(context.actor, each) for each in found_page], **token}
 
 

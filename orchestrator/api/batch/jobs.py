@@ -62,18 +62,15 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         status = request.get("jobStatus", Status.RUNNING)
         query = select(Job).where(Job.parent == job_id, Job.status == status).order_by(Job.array_index, Job.id)
         query = query.options(selectinload(Job.attempts))
-        rows, token = page(
-            context.session, query, request, page_size(request, 1000), (Job.array_index, Job.id), (False, False)
-        )
+        rows, token = page(context.session, query, request, Job.array_index, Job.id, most=1000)
     else:
         queue = context.queue(request["jobQueue"], deleting=True)
         context.actor.check(Operation.LIST_JOBS, JobsOf(queue.name))
         conditions = _conditions(request)
         query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
         query = query.order_by(Job.created_at.desc(), Job.id.desc()).options(selectinload(Job.attempts))
-        most = 100 if request.get("filters") else 1000
-        keys = (Job.created_at, Job.id)
-        rows, token = page(context.session, query, request, page_size(request, most), keys, (True, True))
+        most, keys = 100 if request.get("filters") else 1000, (Job.created_at, Job.id)
+        rows, token = page(context.session, query, request, *keys, descending=(True, True), most=most)
     return {"jobSummaryList": [_summary(job, context.reason(job)) for job in rows], **token}
 
 

@@ -10,7 +10,7 @@ from sqlalchemy import select
 from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.checks import check_choice, check_name, check_range, check_tags
 from orchestrator.api.batch.engine_tags import check_engine_tags
-from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.batch.paging import page
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.usage import utilization
@@ -59,7 +59,7 @@ def describe_job_queues(context: Context, request: dict[str, Any]) -> dict[str, 
     query = select(JobQueue).order_by(JobQueue.name)
     if named := request.get("jobQueues"):
         query = query.where(JobQueue.name.in_([plain_name(each, "job-queue") for each in named]))
-    rows, token = page(context.session, query, request, page_size(request, 100), (JobQueue.name,), (False,))
+    rows, token = page(context.session, query, request, JobQueue.name)
     return {"jobQueues": [_describe(context, queue) for queue in rows], **token}
 
 

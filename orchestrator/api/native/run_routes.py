@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
+from orchestrator.api.http.requests import IdempotencyKey, actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.services import clone as clones
 from orchestrator.services import runs
@@ -132,10 +132,7 @@ def run_metrics(
 
 @router.post("/runs/{name}/resume")
 def resume_run(
-    request: Request,
-    name: str,
-    body: ResumeRequest,
-    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
+    request: Request, name: str, body: ResumeRequest, idempotency_key: IdempotencyKey = None
 ) -> dict[str, Any]:
     """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
     controller, actor = controller_of(request), actor_of(request)
@@ -145,10 +142,7 @@ def resume_run(
 
 @router.post("/runs/{name}/clone")
 def clone_run(
-    request: Request,
-    name: str,
-    body: CloneRequest,
-    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
+    request: Request, name: str, body: CloneRequest, idempotency_key: IdempotencyKey = None
 ) -> dict[str, Any]:
     """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key gets the answer of the first one."""
     controller, actor = controller_of(request), actor_of(request)

@@ -5,11 +5,11 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from fastapi import APIRouter, Header, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import PlainTextResponse, Response
 from pydantic import BaseModel, Field
 
-from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
+from orchestrator.api.http.requests import IdempotencyKey, actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.context import permitted_run
@@ -32,11 +32,7 @@ class SubmitRequest(BaseModel):
 
 
 @router.post("/jobs")
-def submit_job(
-    request: Request,
-    body: SubmitRequest,
-    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
-) -> dict[str, Any]:
+def submit_job(request: Request, body: SubmitRequest, idempotency_key: IdempotencyKey = None) -> dict[str, Any]:
     """Submit the job of a spec; a second call with the same idempotency key gets the answer of the first one.
 
     409 where that key came with another request. ``notes``: warnings about the spec.
