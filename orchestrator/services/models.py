@@ -56,12 +56,10 @@ def register(
             return models.register(
                 controller.access.store, name, run, checkpoint, facts, controller.access.peers.id, again=again
             )
-    except AlreadyRegistered as error:
+    except (AlreadyRegistered, DamagedBundle, DamagedFile) as error:
         raise ClientError(str(error), CONFLICT) from None
     except ModelError as error:
         raise ClientError(str(error)) from None
-    except (DamagedBundle, DamagedFile) as error:
-        raise ClientError(str(error), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"model {name} can't be written ({error.strerror or error})", 503) from None
 

@@ -223,15 +223,9 @@ class Connection(H11Protocol):
 
     def _close(self) -> None:
         """Close when all is sent, or when nothing has been sent for a while."""
+        self._read_on()
         self.transport.close()
-        self._flush(self.transport.get_write_buffer_size() + 1)
-
-    def _flush(self, before: int) -> None:
-        left = self.transport.get_write_buffer_size()
-        if left < before:
-            self._deadline = self.loop.call_later(_FLUSH_TIMEOUT, self._flush, left)
-        else:
-            self.transport.abort()
+        self._await_reader(self.transport.get_write_buffer_size() + 1)
 
     def _refuse(self) -> None:
         message = "too many connections are open; close some, or try again later"
