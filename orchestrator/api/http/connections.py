@@ -173,7 +173,8 @@ class Connection(H11Protocol):
 
     def resume_writing(self) -> None:
         super().resume_writing()
-        self._read_on()
+        if not self.transport.is_closing():  # else the rest must still be sent
+            self._read_on()
         if self._phase == "answer":
             self._connections.has_request(self)
 
