@@ -16,12 +16,11 @@ from functools import partial
 from itertools import chain, islice
 from typing import Any
 
-from botocore.validate import ParamValidator
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from orchestrator.api.batch.service_model import service_model
+from orchestrator.api.batch.service_model import problem_with, service_model
 from orchestrator.api.http.answer_streams import Following
 from orchestrator.api.http.limits import check_size
 from orchestrator.api.logs import filter as log_filter
@@ -106,12 +105,11 @@ def validate(operation: str, request: object) -> dict[str, Any]:
             raise invalid(f"{operation}: zero bytes are not allowed")
     except (UnicodeEncodeError, RecursionError):
         raise invalid(f"{operation}: not text (half a surrogate pair), or nested too deep") from None
-    shape = service_model("logs").operation_model(operation).input_shape
-    report = ParamValidator().validate(request, shape)
-    if report.has_errors():
-        raise invalid(" ".join(report.generate_report().split()))
+    if problem := problem_with("logs", operation, request):
+        raise invalid(problem)
+    members = service_model("logs").operation_model(operation).input_shape.members
     for name, value in request.items():
-        member = shape.members[name]
+        member = members[name]
         size = value if isinstance(value, int) else len(value)
         most = member.metadata.get("max", 2**63 - 1)  # which botocore leaves to the service
         if size > most:
