@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 from fastapi import Depends, Request, Response
@@ -14,11 +13,11 @@ from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import short_id
-from orchestrator.persistence.batch_models import Job
 from orchestrator.services import clone as clones
-from orchestrator.services import derived_jobs, models
+from orchestrator.services import models
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import permitted_run
+from orchestrator.services.derived_jobs import Kind, derive
 from orchestrator.services.permissions import Operation
 from orchestrator.services.resume import resume as resume_job
 from orchestrator.services.spec_submission import Changes
@@ -87,19 +86,19 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
 @_stored.post("/jobs/{reference}/evaluate")
 def evaluate(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that evaluates a checkpoint."""
-    return _derived(request, derived_jobs.evaluate, reference, form)
+    return _derived(request, "evaluate", reference, form)
 
 
 @_stored.post("/jobs/{reference}/export")
 def export(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that exports a checkpoint's policy."""
-    return _derived(request, derived_jobs.export, reference, form)
+    return _derived(request, "export", reference, form)
 
 
 @_stored.post("/jobs/{reference}/record")
 def record(request: Request, reference: str, form: Form = Depends(sent_form)) -> Response:
     """Submit a job that records a checkpoint's policy at work."""
-    return _derived(request, derived_jobs.record, reference, form)
+    return _derived(request, "record", reference, form)
 
 
 @_stored.post("/jobs/{reference}/register")
@@ -112,11 +111,11 @@ def register(request: Request, reference: str, form: Form = Depends(sent_form)) 
     return done(request, f"/jobs/{reference}", told)
 
 
-def _derived(request: Request, submit: Callable[..., Job], reference: str, form: Form) -> Response:
+def _derived(request: Request, kind: Kind, reference: str, form: Form) -> Response:
     """Submit a job that reads a checkpoint, and go to its page. Raises ClientError."""
     run, directory = _run(request, reference, Operation.READ_RUN)
     section = {"checkpoint": _iteration(run, form), **_accepted(form)}
-    job = submit(controller_of(request), actor_of(request), run, section, directory)
+    job = derive(controller_of(request), actor_of(request), run, kind, section, directory)
     return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
 
 

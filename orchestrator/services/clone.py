@@ -53,7 +53,7 @@ def clone(
         idempotency_key: A second call with it answers what the first one did.
 
     Raises:
-        ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
+        ClientError: The source is not a training, its checkpoint is missing or damaged, there is a run of the new name, a change is
             impossible, or the weights can't fit what was changed.
     """
     with using(controller, source.name):

@@ -294,7 +294,9 @@ def _check_run(context: Context, run: str, named: bool) -> None:
         raise ClientError(
             f"run {run} is being written by job {reasons.named(holder.name, holder.id)}; stop it first: muster stop {reasons.short_id(holder.id)}"
         )
-    with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
+    with contextlib.suppress(
+        OSError, ValueError
+    ):  # a store that is unavailable, or damaged: the job's own reason explains it
         target, version = context.run(run), context.controller.access.users.version(run)
         if not named:
             return

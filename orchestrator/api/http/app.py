@@ -129,7 +129,7 @@ async def _refused(request: Request, error: Exception) -> JSONResponse:
             return error_response(f"{request.method} {request.url.path}: {error.detail}", error.status_code)
         case DataError():  # a zero byte, say, which PostgreSQL can't store nor look for
             return error_response(f"the database refuses a value ({str(error.orig).splitlines()[0][:200]})", 400)
-        case DamagedFile():  # jobs write files on the volume, which may hold anything: that is no error of the server
+        case DamagedFile():  # jobs write files on the volume, which may hold anything: that is not an error of the server
             return error_response(f"the store holds a damaged file: {error}", 409)
         case Unavailable():
             return error_response(str(error), 503, "ServerException")

@@ -221,7 +221,7 @@ async def messages(
     while not closing.is_set():
         try:
             events, sampled = await _polled(tail)
-        except (OSError, StoreSilent) as error:  # the store is away: it may come back, and nothing is lost
+        except (OSError, StoreSilent) as error:  # the store is unavailable: it may come back, and nothing is lost
             log.warning("live tail: %s", error)
             events, sampled = [], False
             await asyncio.sleep(_AGAIN)

@@ -251,7 +251,7 @@ def stored_bytes(path: Path) -> int:
 
 
 def is_event(line: LogLine) -> bool:
-    """Whether CloudWatch Logs shows a line: the supervisor's last one is no output of the job."""
+    """Whether CloudWatch Logs shows a line: the supervisor's last one is not output of the job."""
     return line.rank is not None or line.stream != "o" or _IS_END.match(line.text) is None
 
 
