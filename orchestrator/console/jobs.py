@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.http.requests import actor_of, controller_of
-from orchestrator.api.native.job_list import Selection, ids_of, page_of_jobs
+from orchestrator.api.native.job_list import JobSelection, ids_of, page_of_jobs
 from orchestrator.console import formats as words
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import Recent, ServerSentEvent, TableRows, stream
@@ -51,7 +51,7 @@ class _Choice:
 
     filter: Mapping[str, str]
     """``state``, ``queue`` and ``search``; empty for all."""
-    wanted: Selection
+    wanted: JobSelection
     after: str
     before: str
     """The place of the page."""
@@ -128,12 +128,12 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     )
 
 
-def _wanted(state: str, queue: str, search: str) -> Selection:
+def _wanted(state: str, queue: str, search: str) -> JobSelection:
     if state not in GROUPS:
         raise ClientError(f"state {state!r} is not known; it is one of {', '.join(filter(None, GROUPS))}")
     if len(search) > _LONGEST:
         raise ClientError(f"the text to search for has more than {_LONGEST} characters")
-    return Selection(GROUPS[state], queue, search)
+    return JobSelection(GROUPS[state], queue, search)
 
 
 def _window(controller: Controller, actor: Actor, choice: _Choice) -> tuple[dict[str, dict[str, Any]], dict[str, str]]:

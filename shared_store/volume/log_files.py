@@ -149,7 +149,7 @@ def read_log(
 
 
 @dataclass
-class Cursor:
+class LogCursor:
     """A reader's place in one log, which it reads as whole lines."""
 
     position: int = 0

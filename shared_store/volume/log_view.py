@@ -18,7 +18,7 @@ from typing import Protocol
 
 from shared_store.volume.files import DamagedFile, refuse_links
 from shared_store.volume.layout import Run
-from shared_store.volume.log_files import CHUNK, Chunk, Cursor, LogSegment, left_out, log_end, log_segments
+from shared_store.volume.log_files import CHUNK, Chunk, LogCursor, LogSegment, left_out, log_end, log_segments
 from shared_store.volume.logs import LIMIT_REACHED, REPLACED, LogLine, lines_in, timestamp
 
 Places = dict[str, int]
@@ -52,7 +52,7 @@ class NodeLog:
     """A reader's place in one node's log."""
 
     key: Key
-    cursor: Cursor
+    cursor: LogCursor
     returned: int = 0
     """Position up to which lines were returned."""
     newest: str = ""
@@ -247,7 +247,7 @@ class LogView:
     def _log(self, key: Key) -> NodeLog:
         if key not in self._logs:
             start = self.offsets.get(place_of(key), 0)
-            self._logs[key] = NodeLog(key, Cursor(start), start)
+            self._logs[key] = NodeLog(key, LogCursor(start), start)
         return self._logs[key]
 
     def _merged(self, logs: Sequence[NodeLog]) -> list[LogLine]:

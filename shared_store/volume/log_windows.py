@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import accumulate, islice, pairwise
 from operator import itemgetter
 
-from shared_store.volume.log_files import CHUNK, Cursor, LogSegment, left_out, log_end, piece_before
+from shared_store.volume.log_files import CHUNK, LogCursor, LogSegment, left_out, log_end, piece_before
 from shared_store.volume.log_view import Chosen, Key, LogView, Places, place_of
 from shared_store.volume.logs import LIMIT_REACHED, LogLine, lines_in
 
@@ -181,7 +181,7 @@ def _search(
     reached, left = dict(place), _SEARCHED
     for log, segments in chosen.logs().items():
         key, before = place_of(log), len(found) if each else 0
-        cursor = Cursor(reached.get(key, 0))
+        cursor = LogCursor(reached.get(key, 0))
         while (chunk := cursor.read(segments)).data:
             hits = _hits(chunk.data, log, chunk.start, needles, accepts, chosen.rank, most + before - len(found))
             found += hits

@@ -7,9 +7,9 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api.batch import fargate, validation
-from orchestrator.api.batch.checks import check_name, check_range, check_tags
 from orchestrator.api.batch.descriptions import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
 from orchestrator.api.batch.paging import page
+from orchestrator.api.batch.value_checks import check_name, check_range, check_tags
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import JobDefinition
 from orchestrator.services import permissions

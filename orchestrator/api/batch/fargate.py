@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from orchestrator.api.batch.checks import check_choice, check_range
+from orchestrator.api.batch.value_checks import check_choice, check_range
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import FARGATE_MEMBERS
 

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from orchestrator.api.batch import fargate, validation
-from orchestrator.api.batch.checks import check_name, check_tags
 from orchestrator.api.batch.members import check_consumables
+from orchestrator.api.batch.value_checks import check_name, check_tags
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import Job

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.api.batch.checks import check_tags
 from orchestrator.api.batch.engine_tags import check_engine_tags
+from orchestrator.api.batch.value_checks import check_tags
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 from orchestrator.services.arns import split_arn

@@ -7,9 +7,9 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from orchestrator.api.batch.checks import check_range
 from orchestrator.api.batch.ecs import container_name, from_ecs, override_from_ecs
 from orchestrator.api.batch.members import check_consumables, check_members
+from orchestrator.api.batch.value_checks import check_range
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import MOST_NODES, target_nodes

@@ -9,8 +9,8 @@ from typing import Any
 from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
-from orchestrator.api.batch.checks import check_tags
 from orchestrator.api.batch.members import check_log_group
+from orchestrator.api.batch.value_checks import check_tags
 from orchestrator.api.logs.errors import LogsError, absent, invalid, present
 from orchestrator.api.logs.log_events import stored_bytes
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shared_store.volume.files import DamagedFile, open_regular
-from shared_store.volume.log_files import Cursor, LogSegment, left_out, segments_of
+from shared_store.volume.log_files import LogCursor, LogSegment, left_out, segments_of
 from shared_store.volume.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, LogLine, lines_in
 
 _BLOCK = 32 << 10
@@ -102,7 +102,7 @@ class LogFile:
         """End of the head, and the greatest time up to there; None while there is no tail."""
         self._end = 0
         self._top = 0
-        self._cursor = Cursor()
+        self._cursor = LogCursor()
         self._begun += 1
 
     def _extend(self, segments: Sequence[LogSegment]) -> bool:

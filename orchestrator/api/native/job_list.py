@@ -54,7 +54,7 @@ _FAILED_FIRST = (
 
 
 @dataclass(frozen=True)
-class Selection:
+class JobSelection:
     """A filter of jobs: by states, by queue, and by a text in their name, id, run or owner. Empty fields mean all."""
 
     statuses: tuple[Status, ...] = ()
@@ -94,14 +94,14 @@ def find_jobs(
             if queue not in (known := queue_names(session, actor)):
                 raise UnknownQueue(queue, known, 404)
     return page_of_jobs(
-        controller, actor, Selection(tuple(status), queue, search), most, after, before, with_progress=progress
+        controller, actor, JobSelection(tuple(status), queue, search), most, after, before, with_progress=progress
     )
 
 
 def page_of_jobs(
     controller: Controller,
     actor: Actor,
-    selection: Selection,
+    selection: JobSelection,
     most: int = JOBS_A_PAGE,
     after: str = "",
     before: str = "",
@@ -138,7 +138,7 @@ def page_of_jobs(
     }
 
 
-def ids_of(session: Session, actor: Actor, selection: Selection) -> list[str]:
+def ids_of(session: Session, actor: Actor, selection: JobSelection) -> list[str]:
     """The ids of all jobs that are wanted and not over."""
     active = [each for each in selection.statuses or tuple(Status) if not each.is_terminal]
     query = select(Job.id).where(Job.parent.is_(None), *selection.conditions(session), Job.status.in_(active))
