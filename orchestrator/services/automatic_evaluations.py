@@ -77,7 +77,6 @@ class AutomaticEvaluations:
     ) -> None:
         """
         Args:
-            controller: The controller.
             actor_named: The actor of that name with the rights that it has now; None where its key is gone.
             interval: Seconds between two looks.
         """

@@ -127,7 +127,6 @@ def check_names(store: Store, kind: Any, config: Mapping[str, Any], key_of: Call
     """Raise ClientError where a configuration names something that the store does not have, or has damaged.
 
     Args:
-        store: The store.
         kind: The configuration's class, a :class:`worker.settings.task.TaskConfig`.
         config: Some of its fields.
         key_of: From one of them to the job's key that gives it.

@@ -46,7 +46,6 @@ def clone(
     """Submit a job whose run begins at iteration 0 with the weights of ``source``; refusals come before a job exists.
 
     Args:
-        controller: The controller.
         source: Whose weights.
         name: Of the new run, and of its job.
         changes: The changes of its spec, and the checkpoint.

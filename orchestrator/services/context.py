@@ -282,8 +282,6 @@ def visible_runs(
     """The runs of the store that the actor may see, by name.
 
     Args:
-        controller: The controller.
-        actor: Who asks.
         after: Those behind this name.
         most: At most so many.
         search: Those with this text in their names.

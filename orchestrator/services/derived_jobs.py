@@ -25,7 +25,6 @@ def derive(
     """Submit a job that evaluates, exports or records a checkpoint's policy.
 
     Args:
-        controller: The controller.
         actor: Who asks; must be allowed to read the run.
         run: Of the training.
         kind: What the job does.

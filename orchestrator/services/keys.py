@@ -31,7 +31,6 @@ def create(
 
     Args:
         keys: Where it is kept; None for a server without keys.
-        actor: Who asks.
         name: Of the key.
         queues: Names of the queues that it may use; all where empty.
         read_only: Whether it may change nothing.

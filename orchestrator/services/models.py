@@ -28,8 +28,6 @@ def register(
     """Keep the exported bundle of a checkpoint as the next version of a model.
 
     Args:
-        controller: The controller.
-        actor: Who asks.
         run_name: The run of the checkpoint.
         name: Of the model.
         requested: Iteration of the checkpoint, ``best`` or ``latest``; the newest where None.

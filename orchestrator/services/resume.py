@@ -44,7 +44,6 @@ def resume(
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
     Args:
-        controller: The controller.
         run: The run.
         changes: The changes. The run keeps its worlds; another number of nodes shares them anew.
         idempotency_key: A second call with it answers what the first one did.

@@ -117,7 +117,6 @@ def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], 
     Raises ClientError.
 
     Args:
-        controller: The controller.
         submit: Submits it with a copy, or raises :class:`TeacherNeeded`.
     """
     try:

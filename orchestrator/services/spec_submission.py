@@ -138,7 +138,6 @@ def submit(
     """Register the definition, where the newest of its name is another one, and submit the job; nothing is committed.
 
     Args:
-        context: The call.
         spec: Of the job.
         directory: Its working directory.
         what: Begins the words of a refusal; empty where the spec is the caller's own, who then learns what to change.

@@ -407,7 +407,6 @@ def revision(
     """A revision of a definition, to be added to the session.
 
     Args:
-        context: The call.
         name: Of the definition.
         document: The request of RegisterJobDefinition, without tags.
         gang: What the document asks for.

@@ -30,7 +30,6 @@ def page(
     """The rows behind ``nextToken``, and the token of the next page where there is one.
 
     Args:
-        session: The session.
         query: Rows, ordered by ``keys``.
         request: Holds ``maxResults`` and ``nextToken``.
         keys: The columns of the order; together they are unique.

@@ -62,7 +62,6 @@ async def answer(
 
     Args:
         controller: Whose logs these are.
-        actor: Who asks.
         ending: Set when the server ends, which ends the streams.
         target: The header ``X-Amz-Target``.
         body: Reads the request's JSON. Raises ClientError.

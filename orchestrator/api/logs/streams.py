@@ -78,8 +78,6 @@ def newest_streams(
     """Up to MOST_STREAMS streams of jobs, of the newest jobs that the caller may see.
 
     Args:
-        session: On the database.
-        store: The store that holds the files.
         groups: Names of the log groups.
         prefix: Of the names of the streams; empty for all.
         since: Attempts that ended before this Unix time [ms] are left out.
