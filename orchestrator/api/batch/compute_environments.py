@@ -11,8 +11,8 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api.batch import fargate, validation
-from orchestrator.api.batch.engine_tags import check_engine_tags
 from orchestrator.api.batch.paging import page
+from orchestrator.api.batch.tags import check_engine_tags
 from orchestrator.api.batch.value_checks import check_choice, check_name, check_range, check_tags
 from orchestrator.control.compute_environments import is_built_in
 from orchestrator.domain.errors import ClientError
