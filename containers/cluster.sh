@@ -27,7 +27,7 @@ controller)
   join() { ray start --address="$RAY_HEAD" --node-name=controller --num-cpus=0 $small; }
   until join; do sleep 2; done
   (while sleep 5; do grep -qs '^raylet' /proc/[0-9]*/comm || join || true; done) &
-  muster serve --engine ray --host 0.0.0.0 --port 8080 --store /muster/store &
+  muster serve --engine ray --host 0.0.0.0 --port 8080 --store /muster/store --trust-proxy "$MUSTER_PROXY" &
   serving=$!
   trap 'kill "$serving" 2>/dev/null || true' TERM INT
   until wait "$serving" || ! kill -0 "$serving" 2>/dev/null; do :; done   # a signal, too, ends a wait

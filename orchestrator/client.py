@@ -12,6 +12,7 @@ import re
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 from urllib.parse import quote, urlsplit
@@ -20,7 +21,7 @@ import httpx
 
 from orchestrator.domain.errors import ApiError, NotServing, NoUrl, Unreachable
 from orchestrator.domain.job import TERMINAL
-from orchestrator.home import local_controller, muster_home
+from orchestrator.home import local_socket, muster_home, published
 from shared_store.volume.texts import digest_of
 
 EXAMPLE_URL = "http://127.0.0.1:8080"
@@ -55,8 +56,8 @@ def _is_url(text: str) -> bool:
 class Client:
     """Requests to one controller."""
 
-    def __init__(self, url: str, token: str | None = None) -> None:
-        """Raises NoUrl where ``url`` is none."""
+    def __init__(self, url: str, token: str | None = None, socket: Path | None = None) -> None:
+        """Raises NoUrl where ``url`` is malformed. ``socket``: a Unix socket of the controller, which is used in place of TCP."""
         if not _is_url(url):
             raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {EXAMPLE_URL}")
         self.url = url
@@ -69,7 +70,8 @@ class Client:
         self.notify: Callable[[str], object] = lambda line: None
         """Is called with what a person would like to know while nothing happens."""
         headers = {"Authorization": f"Bearer {token}"} if token else {}
-        self._http = httpx.Client(base_url=url, headers=headers, timeout=30, trust_env=False)
+        transport = httpx.HTTPTransport(uds=str(socket), verify=False) if socket else None  # it has no TLS to verify
+        self._http = httpx.Client(base_url=url, headers=headers, timeout=30, trust_env=False, transport=transport)
 
     @classmethod
     def connect(cls, url: str | None = None, *, serving: bool = False) -> Client:
@@ -82,16 +84,18 @@ class Client:
             NotServing: It answers that it can't serve now, and ``serving`` is set; without its store it can still list and stop jobs.
             ApiError: The token is refused.
         """
-        found = not (url or os.environ.get("MUSTER_URL"))
-        here, is_temporary = local_controller() if found else (None, False)
-        url = url or os.environ.get("MUSTER_URL") or here
+        home, url = muster_home(), url or os.environ.get("MUSTER_URL")
+        here, found = published(home), url is None
         if url is None:
-            raise Unreachable(
-                f"no controller of {muster_home()} runs; start one with `muster serve`, or set MUSTER_URL to that of another one, "
-                f"such as {EXAMPLE_URL}"
-            )
-        client = cls(url, os.environ.get("MUSTER_TOKEN"))
-        client.found, client.is_temporary = found, is_temporary
+            if here is None:
+                raise Unreachable(
+                    f"no controller of {home} runs; start one with `muster serve`, or set MUSTER_URL to that of another one, "
+                    f"such as {EXAMPLE_URL}"
+                )
+            url = here.url
+        is_here = here is not None and here.url == url
+        client = cls(url, os.environ.get("MUSTER_TOKEN"), local_socket(home) if is_here else None)
+        client.found, client.is_temporary = found, found and here is not None and here.temporary
         try:
             client.get("/healthz")
         except NotServing:
@@ -173,12 +177,12 @@ class Client:
         return self.get(f"/api/jobs/{named(job)}")["status"] in TERMINAL
 
     def _stream(self, job: str, query: dict[str, Any], positions: dict[str, int]) -> Iterator[list[dict[str, Any]]]:
-        wanted = {key: value for key, value in query.items() if value is not None}
+        parameters = {key: value for key, value in query.items() if value is not None}
         if positions:
-            wanted["positions"] = json.dumps(positions)
+            parameters["positions"] = json.dumps(positions)
         try:
             with self._http.stream(
-                "GET", f"/api/jobs/{named(job)}/logs", params=wanted, timeout=httpx.Timeout(30, read=60)
+                "GET", f"/api/jobs/{named(job)}/logs", params=parameters, timeout=httpx.Timeout(30, read=60)
             ) as answer:
                 if answer.is_error:
                     answer.read()

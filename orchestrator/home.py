@@ -7,15 +7,18 @@ import json
 import logging
 import os
 import re
+import socket
+import stat
 import time
 from contextlib import suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from orchestrator.domain.errors import ServerError
 
 _OURS = re.compile(
-    r"controller\.(json|lock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?console\..*|\.?sealing\..*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
+    r"controller\.(json|lock|sock)|muster\.db(-.*|\.lock)?|\.?keys\..*|\.?bus(-users|\.).*|\.?console\..*|\.?sealing\..*|\.?aws\..*|store|supervisors|kernels|ray|lost\+found"
 )
 """Names in the home directory: database, sealing key, bus, what older Musters had there, the engines' directories, and what a volume has of itself."""
 
@@ -23,6 +26,8 @@ _DIRECTORIES = ("store", "supervisors", "kernels", "ray")
 """Of these, the directories: of runs, and of what engines and jobs keep."""
 _MADE_LATER = ("supervisors", "kernels")
 """Of these, those that are made by jobs or for them, who would make them open."""
+
+SOCKET = "controller.sock"
 
 _PATIENCE = 10.0
 """Seconds to wait for a controller that starts or ends, and for a command's temporary one."""
@@ -35,35 +40,66 @@ def muster_home() -> Path:
     return Path(os.environ.get("MUSTER_HOME") or "~/.muster").expanduser().absolute()
 
 
+@dataclass(frozen=True)
+class Published:
+    """What the controller of a home directory has published of itself."""
+
+    pid: int
+    url: str
+    temporary: bool
+    """Whether it goes away with the command that started it."""
+    region: str
+    """AWS region in its ARNs."""
+    database: str
+    """Without a password."""
+
+
+def published(home: Path) -> Published | None:
+    """The controller of a home directory; None where it does not run, or not yet."""
+    try:
+        found = Published(**json.loads((home / "controller.json").read_text()))
+        os.kill(found.pid, 0)
+        return found
+    except (OSError, ValueError, TypeError):
+        return None
+
+
 def local_url() -> str | None:
     """URL at which the controller of this home directory listens; None where it does not run."""
-    return local_controller()[0]
+    found = published(muster_home())
+    return found.url if found else None
 
 
-def local_controller() -> tuple[str | None, bool]:
-    """:func:`local_url`, and whether that controller goes away with the command that started it."""
-    found = _published(muster_home())
-    return (str(found["url"]), bool(found["temporary"])) if found else (None, False)
+def local_socket(home: Path) -> Path | None:
+    """The Unix socket of a home directory's controller, where that is the present user's."""
+    path = home / SOCKET
+    with suppress(OSError):
+        found = path.lstat()
+        if stat.S_ISSOCK(found.st_mode) and found.st_uid == os.geteuid():
+            return path
+    return None
 
 
-def local_region() -> str:
-    """The AWS region in the ARNs of this home directory's controller; the default one where it does not run."""
-    return str((_published(muster_home()) or {}).get("region") or "us-east-1")
+def open_socket(home: Path) -> socket.socket | None:
+    """A Unix socket in a home directory for commands of its user, whose lock is held.
 
-
-def local_database(home: Path) -> str | None:
-    """The database of the controller of a home directory, without a password; None where it does not run."""
-    return (_published(home) or {}).get("database")
-
-
-def _published(home: Path) -> dict[str, Any] | None:
-    """What the controller of a home directory tells of itself; None where it does not run, or not yet."""
+    None where another user could put something in its place, and where the path is longer than the kernel takes (107 bytes):
+    then commands use TCP.
+    """
+    path = home / SOCKET
+    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        found = json.loads((home / "controller.json").read_text())
-        os.kill(int(found["pid"]), 0)
-        return {"url": found["url"], **{name: found.get(name) for name in ("temporary", "region", "database")}}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
+        path.unlink(missing_ok=True)
+        found = home.stat()
+        if found.st_uid == os.geteuid() and not found.st_mode & 0o022:
+            listener.bind(str(path))
+            path.chmod(0o600)  # nobody can connect before it listens
+            listener.listen(128)
+            return listener
+    except OSError as error:
+        log.debug("%s can't be used: %s", path, error)
+    listener.close()
+    return None
 
 
 def make_private(home: Path) -> None:
@@ -81,7 +117,7 @@ def make_private(home: Path) -> None:
         log.warning("%s was open to other users; it is closed to them now (chmod 700)", home)
         return
     for name in _MADE_LATER:
-        with suppress(OSError):  # said by what needs it
+        with suppress(OSError):  # reported by what needs it
             (home / name).mkdir(mode=0o700, exist_ok=True)
     ours = [home / name for name in _DIRECTORIES if (home / name).is_dir() and not (home / name).is_symlink()]
     is_open = [path.name for path in ours if not _closed(path)]
@@ -125,11 +161,11 @@ class HomeLock:
         self._file: IO[str] = open(home / "controller.lock", "a")  # noqa: SIM115 - held until release()
         until = time.monotonic() + _PATIENCE
         while not self._taken():
-            holder = _published(home)
-            if (holder and (temporary or not holder["temporary"])) or time.monotonic() > until:
+            holder = published(home)
+            if (holder and (temporary or not holder.temporary)) or time.monotonic() > until:
                 self._file.close()
                 raise ControllerRuns(
-                    f"{home}: already served by {describe_holder(home)}; use that one, stop it, or set MUSTER_HOME to another directory"
+                    f"{home}: already served by {_holder(home)}; use that one, stop it, or set MUSTER_HOME to another directory"
                 )
             time.sleep(0.05)
 
@@ -144,25 +180,26 @@ class HomeLock:
         """Tell commands on this machine where the controller listens, whether it goes away with the command that started it, its AWS
         region, and its database (without a password).
         """
-        published = {"pid": os.getpid(), "url": url, "temporary": temporary, "region": region, "database": database}
+        found = Published(os.getpid(), url, temporary, region, database)
         try:
-            self.path.write_text(json.dumps(published))
+            self.path.write_text(json.dumps(asdict(found)))
         except OSError as error:
             log.warning("%s can't be written (%s); commands need MUSTER_URL=%s", self.path, error.strerror, url)
 
     def withdraw(self) -> None:
         """Commands find this controller no more, and wait for the lock."""
         self.path.unlink(missing_ok=True)
+        self.path.with_name(SOCKET).unlink(missing_ok=True)
 
     def release(self) -> None:
         self.withdraw()
         self._file.close()
 
 
-def describe_holder(home: Path) -> str:
+def _holder(home: Path) -> str:
     """The holder of the lock of ``home``, as far as it is known."""
     try:
-        told = json.loads((home / "controller.json").read_text())
-        return f"a controller (pid {told['pid']}, {told['url']})"
+        found = json.loads((home / "controller.json").read_text())
+        return f"a controller (pid {found['pid']}, {found['url']})"
     except (OSError, ValueError, KeyError):
         return "another controller"

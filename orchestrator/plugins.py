@@ -17,7 +17,7 @@ from shared_store.contract.plugins import Plugin, PluginError, load, plugins
 def add_plugins(app: FastAPI) -> None:
     """Add the routes and pages of all plug-ins, after the controller's own.
 
-    Raises PluginError: a part is no router or can't be imported, a route is there already or is none that a permission can guard,
+    Raises PluginError: a part is not a router or can't be imported, a route exists already or can't be guarded by a permission,
     or an operation or an entry of the navigation has no route.
     """
     taken = [(operation, "the controller") for operation in _operations(_routes(app.routes))]
@@ -59,7 +59,7 @@ def _included(app: FastAPI, name: str, plugin: Plugin) -> Iterator[tuple[BaseRou
         try:
             app.include_router(load(place, APIRouter), prefix=prefix, dependencies=[Depends(check)])
         except (AssertionError, RuntimeError) as error:  # FastAPI refuses it
-            raise PluginError(f"plug-in {name}: {place} is no router that can be used ({error})") from error
+            raise PluginError(f"plug-in {name}: {place} is not a usable router ({error})") from error
         for route, path in _routes(app.routes[before:]):
             if not isinstance(route, APIRoute):
                 raise PluginError(

@@ -19,9 +19,9 @@ import uvicorn
 
 from orchestrator.api.http.access import Access
 from orchestrator.api.http.app import BROWSER_HEADERS, create_app
-from orchestrator.api.http.auth import is_loopback
 from orchestrator.api.http.connections import Connection, Connections, Seldom, Serving, raise_descriptor_limit
 from orchestrator.api.http.limits import RATE, RateLimit
+from orchestrator.api.http.request_head import is_loopback
 from orchestrator.console import add_console
 from orchestrator.control.account import recognise as recognise_account
 from orchestrator.control.bus import Bus
@@ -32,14 +32,14 @@ from orchestrator.control.disk import DEFAULT, MinFree
 from orchestrator.control.peers import Peers
 from orchestrator.control.presence import LOST_AFTER, Presence
 from orchestrator.control.store_identity import recognise
-from orchestrator.control.webhooks import Webhook, WebhooksError, read_webhooks, settle_webhooks
+from orchestrator.control.webhooks import WebhooksError, read_webhooks, settle_webhooks
 from orchestrator.domain.errors import ServerError, UsageError
 from orchestrator.engines.api import EngineError, Setting
 from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.gangs import running_gangs
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.secrets import Secrets, SecretsError
-from orchestrator.home import HomeLock
+from orchestrator.home import HomeLock, open_socket
 from orchestrator.persistence.access_keys import KeyStore
 from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.home_files import move_in
@@ -105,7 +105,7 @@ class Server:
         ``lost_after``: seconds of a node's silence on the bus after which it may be lost (:mod:`orchestrator.control.presence`).
         ``squeue_interval``: seconds between two calls of ``squeue``; None: as the slurm engine chooses.
         ``secrets``: where the secrets come from that jobs are given (:class:`orchestrator.engines.secrets.Secrets`); None: jobs get none.
-        ``webhooks``: path of a file of those who are told when jobs end (:func:`orchestrator.control.webhooks.read_webhooks`); None:
+        ``webhooks``: path of a file of the receivers of messages about ended jobs (:func:`orchestrator.control.webhooks.read_webhooks`); None:
         those of the database. A ``temporary`` controller has none.
         ``trusted_proxies``: addresses and networks of reverse proxies whose ``X-Forwarded-For`` and ``-Proto`` are believed.
 
@@ -115,76 +115,61 @@ class Server:
         self._temporary = temporary
         _check_token(token)
         _check_proxies(trusted_proxies)
-        given = _read_webhooks(webhooks)
         exposed = not is_loopback(host) or bool(trusted_proxies)
-        with ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
+        with _explained(), ExitStack() as stack:  # whatever fails below, nothing of what came before it is left open
+            new_webhooks = None if webhooks is None else read_webhooks(webhooks)
             self._lock = _take_lock(home, temporary)
             stack.callback(self._lock.release)
-            self._socket = _listen(host, port)
-            stack.callback(self._socket.close)
-            nodes = _make_engines(
-                engines, Setting(home, cpus, gpus, squeue_interval)
-            )  # before anything is made in the home directory
+            self._sockets = [_listen(host, port)]
+            stack.callback(self._sockets[0].close)
+            if (local := open_socket(home)) is not None:
+                self._sockets.append(local)
+                stack.callback(local.close)
+            # before anything is made in the home directory
+            nodes = _make_engines(engines, Setting(home, cpus, gpus, squeue_interval))
             stack.callback(nodes.close)
             if store is None:
                 stack.enter_context(_default_store(home / "store"))
             self.store = Store(store or home / "store")
             self.store.check_writable()
-            try:
-                found = Database.at(home, database)
-                stack.callback(found.close)
-                own = OwnSecrets(found, home)
-                self.keys = KeyStore(own)
-                move_in(home, own, self.keys)
-                console = bytes.fromhex(own.made(CONSOLE, lambda: token_bytes(32).hex()))
-                self.access = Access(self.keys, token, exposed, exposed, os.geteuid(), console_secret=console)
-                _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access, database)
-                stack.callback(self.keys.close)
-                nodes.secrets = Secrets(secrets)
-                with found.session() as session:
-                    arns.settle(recognise_account(session, account, region, temporary))
-                    identity = recognise(session, self.store, adopt_store)
-                    nodes.arrange(in_order(session, nodes.names))
-                    ensure_compute_environments(session, nodes.names)
-                if any(engine.traits.as_owner for engine in nodes.engines.values()):
-                    self.store.check_owner()
-                told = () if temporary else settle_webhooks(own, given)
-            except (DatabaseError, SecretsError, WebhooksError) as error:
-                raise ServerError(str(error)) from None
+            found = Database.at(home, database)
+            stack.callback(found.close)
+            own = OwnSecrets(found, home)
+            self.keys = KeyStore(own)
+            move_in(home, own, self.keys)
+            console = bytes.fromhex(own.made(CONSOLE, lambda: token_bytes(32).hex()))
+            self.access = Access(self.keys, token, exposed, exposed, os.geteuid(), console_secret=console)
+            _check_exposure("--trust-proxy" if is_loopback(host) else f"--host {host}", self.access, database)
+            stack.callback(self.keys.close)
+            nodes.secrets = Secrets(secrets)
+            with found.session() as session:
+                arns.settle(recognise_account(session, account, region, temporary))
+                identity = recognise(session, self.store, adopt_store)
+                nodes.arrange(in_order(session, nodes.names))
+                ensure_compute_environments(session, nodes.names)
+            if any(engine.traits.as_owner for engine in nodes.engines.values()):
+                self.store.check_owner()
+            receivers = () if temporary else settle_webhooks(own, new_webhooks)
             self.bus = Bus(home, own, nodes.addresses, Presence(lost_after))
             stack.callback(self.bus.close)
             self.peers = Peers(self.store, home, identity.check)
             stack.callback(self.peers.close)
-            try:
-                self.controller = Controller(
-                    found,
-                    nodes,
-                    self.store,
-                    self.bus,
-                    self.peers,
-                    retention=retention,
-                    min_free=min_free,
-                    identity=identity,
-                )
-            except DatabaseError as error:
-                raise ServerError(str(error)) from None
+            parts = found, nodes, self.store, self.bus, self.peers
+            self.controller = Controller(*parts, retention=retention, min_free=min_free, identity=identity)
             stack.callback(self.controller.close)
             self.evaluations = AutomaticEvaluations(self.controller, self.access.actor_named)
             stack.callback(self.evaluations.close)
             _name_lost_gangs(home, found)
-            bound = self._socket.getsockname()[1]
-            self.url = (
-                f"http://{'127.0.0.1' if host in ('0.0.0.0', '::') else f'[{host}]' if ':' in host else host}:{bound}"
-            )
-            self.deliveries = Deliveries(self.controller, told, self.url)
+            bound = self._sockets[0].getsockname()[1]
+            name = "127.0.0.1" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+            self.url = f"http://{name}:{bound}"
+            self.deliveries = Deliveries(self.controller, receivers, self.url)
             stack.callback(self.deliveries.close)
-            limit = RateLimit(rate_limit, submit_rate_limit)
-            self.app = create_app(self.controller, self.access, limit, self.deliveries)
-            try:
-                add_console(self.app)
-                add_plugins(self.app)
-            except PluginError as error:
-                raise ServerError(str(error)) from error
+            self.app = create_app(
+                self.controller, self.access, RateLimit(rate_limit, submit_rate_limit), self.deliveries
+            )
+            add_console(self.app)
+            add_plugins(self.app)
             self._opened = stack.pop_all()
         connections = Connections(raise_descriptor_limit())
         config = uvicorn.Config(
@@ -203,7 +188,7 @@ class Server:
         logging.getLogger("asyncio").addFilter(_NO_DESCRIPTOR)
         self._uvicorn = Serving(config)
         self._thread = threading.Thread(
-            target=self._uvicorn.run, kwargs={"sockets": [self._socket]}, name="http", daemon=True
+            target=self._uvicorn.run, kwargs={"sockets": self._sockets}, name="http", daemon=True
         )
 
     def start(self) -> None:
@@ -230,6 +215,15 @@ class Server:
 
 
 @contextmanager
+def _explained() -> Iterator[None]:
+    """A block whose errors are those of a start, in one line each."""
+    try:
+        yield
+    except (DatabaseError, EngineError, PluginError, SecretsError, WebhooksError) as error:
+        raise ServerError(str(error)) from error
+
+
+@contextmanager
 def _default_store(path: Path) -> Iterator[None]:
     """A context that begins with the directory; it is taken back where nothing came into it, since a volume may belong there."""
     try:
@@ -245,13 +239,6 @@ def _default_store(path: Path) -> Iterator[None]:
                 path.rmdir()
 
 
-def _read_webhooks(source: str | None) -> Sequence[Webhook] | None:
-    try:
-        return None if source is None else read_webhooks(source)
-    except WebhooksError as error:
-        raise ServerError(str(error)) from None
-
-
 def _take_lock(home: Path, temporary: bool) -> HomeLock:
     try:
         return HomeLock(home, temporary)
@@ -262,14 +249,11 @@ def _take_lock(home: Path, temporary: bool) -> HomeLock:
 
 
 def _make_engines(names: Sequence[str], setting: Setting) -> EngineSet:
-    """The engines; where one can't be made, those before it are closed. Raises ServerError."""
+    """The engines; where one can't be made, those before it are closed. Raises EngineError."""
     with ExitStack() as stack:
         made = []
         for name in dict.fromkeys(names):
-            try:
-                made.append(make_engine(name, setting))
-            except EngineError as error:
-                raise ServerError(str(error)) from None
+            made.append(make_engine(name, setting))
             stack.callback(made[-1].close)
         several = EngineSet(made)
         stack.pop_all()
@@ -283,8 +267,8 @@ def _name_lost_gangs(home: Path, database: Database) -> None:
             if session.get(Job, gang.partition("/")[0]) is not None:
                 continue
         log.error(
-            "gang %s runs on this machine, but the database has no such job (was it deleted, or replaced by an older copy?); "
-            "nothing watches the gang any more; end it with: kill %s",
+            "orphaned gang %s runs on this machine, but the database has no such job (was it deleted, or replaced by an older copy?); "
+            "terminate it with: kill %s",
             gang,
             " ".join(map(str, pids)),
         )
@@ -293,9 +277,9 @@ def _name_lost_gangs(home: Path, database: Database) -> None:
 def _check_exposure(option: str, access: Access, database: str | None) -> None:
     """Raises ServerError where others could come in without a key."""
     if access.exposed and not access.token and not access.known():
-        there = f" (with the same --database as here: {shown(database)})" if database else ""
+        hint = f" (with the same --database as here: {shown(database)})" if database else ""
         raise ServerError(
-            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`{there}, or set "
+            f"{option}: the server is reachable from other machines: first create a key with `muster keys create NAME`{hint}, or set "
             "MUSTER_TOKEN to a secret, here and for the clients"
         )
 

@@ -17,7 +17,7 @@ from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import EXAMPLE_URL
 from orchestrator.domain.errors import ServerError, Unavailable, UsageError
-from orchestrator.home import ControllerRuns, HomeLock, local_database, local_region, local_url, muster_home
+from orchestrator.home import ControllerRuns, HomeLock, muster_home, published
 from orchestrator.persistence.access_keys import KeyStore
 from orchestrator.persistence.home_files import move_in
 from orchestrator.persistence.own_secrets import OwnSecrets
@@ -72,14 +72,15 @@ def create(
     if as_json:
         echo_json({**key.describe(), "secretAccessKey": key.secret})
         return
-    url = local_url() or EXAMPLE_URL
+    running = published(muster_home())
+    url, region = (running.url, running.region) if running else (EXAMPLE_URL, "us-east-1")
     echo(
         f"""created key {key.name} ({key.rights}, share {key.share}); its secret is shown only this once
 
 AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(profile_name="{key.name}")):
   aws configure set aws_access_key_id {key.access_key_id} --profile {key.name}
   aws configure set aws_secret_access_key {key.secret} --profile {key.name}
-  aws configure set region {local_region()} --profile {key.name}
+  aws configure set region {region} --profile {key.name}
   aws configure set endpoint_url {url} --profile {key.name}
 
 muster, and 'Authorization: Bearer …' elsewhere:
@@ -149,8 +150,8 @@ def opened(home: Path, database: str | None = None) -> Iterator[KeyStore]:
 
 def _check_same(home: Path, database: str | None) -> None:
     """Raises UsageError where the controller that runs on this home directory has another database."""
-    running = local_database(home)
-    if running is not None and running != shown(str(make_url(database_url(home, database)))):
+    running = published(home)
+    if running is not None and running.database != shown(str(make_url(database_url(home, database)))):
         raise UsageError(
-            f"the controller of {home} has its keys in {running}: set --database or MUSTER_DATABASE to that"
+            f"the controller of {home} has its keys in {running.database}: set --database or MUSTER_DATABASE to that"
         )

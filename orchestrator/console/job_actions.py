@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 from fastapi import Depends, Request, Response
@@ -14,12 +13,11 @@ from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.routing import page_router
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.reasons import short_id
-from orchestrator.persistence.batch_models import Job
 from orchestrator.services import clone as clones
-from orchestrator.services import derived_jobs as jobs
 from orchestrator.services import models
 from orchestrator.services.chosen_checkpoints import CONFLICT, choose
 from orchestrator.services.context import permitted_run
+from orchestrator.services.derived_jobs import Kind, derive
 from orchestrator.services.permissions import Operation
 from orchestrator.services.resume import resume as resume_job
 from orchestrator.services.spec_submission import Changes
@@ -86,7 +84,7 @@ def clone(request: Request, reference: str, form: Form = Depends(sent_form)) -> 
     return done(request, f"/jobs/{cloned['jobId']}", f"cloned {source} as run {cloned['run']}")
 
 
-def _add_derived(kind: str, submit: Callable[..., Job]) -> None:
+def _add_derived(kind: Kind) -> None:
     """Add the route that submits a job of a kind, which reads a checkpoint, and leads to its page."""
 
     @_stored.post(f"/jobs/{{reference}}/{kind}")
@@ -95,12 +93,13 @@ def _add_derived(kind: str, submit: Callable[..., Job]) -> None:
         if (chosen := choose(run, _checkpoint(form))) is None:
             raise ClientError(f"run {run.name} has no checkpoint yet; train it first")
         section = {"checkpoint": chosen.iteration, **({"accept_changed_robot": True} if _accepts(form) else {})}
-        job = submit(controller_of(request), actor_of(request), run, section, directory)
+        job = derive(controller_of(request), actor_of(request), run, kind, section, directory)
         return done(request, f"/jobs/{job.id}", f"submitted {job.name}")
 
 
-for _kind, _submit in (("evaluate", jobs.evaluate), ("export", jobs.export), ("record", jobs.record)):
-    _add_derived(_kind, _submit)
+_add_derived("evaluate")
+_add_derived("export")
+_add_derived("record")
 
 
 @_stored.post("/jobs/{reference}/register")

@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 
 from fastapi import Request, Response
 
-from orchestrator.api.http.auth import is_loopback
+from orchestrator.api.http.request_head import is_loopback
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.routes import job_detail
 from orchestrator.console.forms import done

@@ -11,7 +11,7 @@ from urllib.parse import urlencode
 from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.http.requests import actor_of, controller_of
-from orchestrator.api.native.job_list import Wanted, ids_of, page_of_jobs
+from orchestrator.api.native.job_list import JobSelection, ids_of, page_of_jobs
 from orchestrator.console.forms import Form, Question, done, sent_form
 from orchestrator.console.live import LiveParts, Recent, Table, stream
 from orchestrator.console.pages import render
@@ -58,9 +58,9 @@ class _Choice:
         return {"state": self.state, "queue": self.queue, "search": self.search}
 
     @property
-    def wanted(self) -> Wanted:
+    def selection(self) -> JobSelection:
         """Raises ClientError."""
-        return _wanted(**self.filter)
+        return _selection(**self.filter)
 
 
 _Chosen = Annotated[_Choice, Depends()]
@@ -81,7 +81,7 @@ def jobs(request: Request, choice: _Chosen) -> Response:
 def jobs_stream(request: Request, choice: _Chosen) -> Response:
     """The changes in a window of the table, as events."""
     live = LiveParts(request, "jobs_live.html", chosen=choice.filter)
-    _ = choice.wanted  # refused at once, if at all
+    _ = choice.selection  # refused at once, if at all
     read = partial(_parts, controller_of(request), actor_of(request), choice)
     return stream(request, lambda: live.changes(read()))
 
@@ -92,7 +92,7 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     controller, actor = controller_of(request), actor_of(request)
     chosen = {each: form.one(each) for each in ("state", "queue", "search")}
     if form.one("all") == "yes":
-        found = _wanted(**chosen)
+        found = _selection(**chosen)
         with controller.database.session() as session:
             ids = ids_of(session, actor, found)
     else:
@@ -111,12 +111,12 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     return done(request, _address(**chosen), f"{several} asked to stop")
 
 
-def _wanted(state: str, queue: str, search: str) -> Wanted:
+def _selection(state: str, queue: str, search: str) -> JobSelection:
     if state not in GROUPS:
         raise ClientError(f"state {state!r} is not known; it is one of {', '.join(filter(None, GROUPS))}")
     if len(search) > _LONGEST:
         raise ClientError(f"the text to search for has more than {_LONGEST} characters")
-    return Wanted(GROUPS[state], queue, search)
+    return JobSelection(GROUPS[state], queue, search)
 
 
 def _parts(controller: Controller, actor: Actor, choice: _Choice) -> dict[str, Any]:
@@ -126,7 +126,7 @@ def _parts(controller: Controller, actor: Actor, choice: _Choice) -> dict[str, A
 
 
 def _read_parts(controller: Controller, actor: Actor, choice: _Choice) -> dict[str, Any]:
-    found = page_of_jobs(controller, actor, choice.wanted, ROWS, choice.after, choice.before)
+    found = page_of_jobs(controller, actor, choice.selection, ROWS, choice.after, choice.before)
     counts, more, rows = found["counts"], "+" if found["areMore"] else "", found["jobs"]
     address = partial(_address, **choice.filter)
     return {

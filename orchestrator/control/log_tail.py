@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from orchestrator import machine
 from shared_store.volume.layout import Run
-from shared_store.volume.log_files import UNKNOWN, Chunk, Identity, LogSegment, read_log
-from shared_store.volume.log_view import Key, log_end, logs_of
+from shared_store.volume.log_files import CHUNK, UNKNOWN, Chunk, Identity, LogSegment, log_end, read_log
+from shared_store.volume.log_view import Key, logs_of
 
 MOST = 256 << 10
 """Bytes that are kept of a log, and of the pushes to it that came too early, for each."""
@@ -24,8 +24,6 @@ FRESH = 3.5
 """Seconds for which a node's word counts about the end of its log: it repeats it every second."""
 _EARLY = 64
 """Pushes to a log that came too early and are kept: a few are overtaken, and a hostile node sends any number."""
-_READ = 1 << 20
-"""Bytes that one look reads of a log: more than the longest line. Of a log that grew by more, followers read the files themselves."""
 
 
 class Found(NamedTuple):
@@ -99,8 +97,8 @@ class Tail:
     def missing(self, segments: Sequence[LogSegment]) -> Found:
         """What the file has after the end; nothing where that is not visible here yet. Raises OSError."""
         is_ahead = self.fed and (self.stated is None or self.stated >= self.end)
-        chunk = read_log(segments, self.end, _READ, self.identity, self.inside, is_ahead)
-        return Found(None, log_end(segments)) if len(chunk.data) == _READ and chunk.more else Found(chunk, 0)
+        chunk = read_log(segments, self.end, CHUNK, self.identity, self.inside, is_ahead)
+        return Found(None, log_end(segments)) if len(chunk.data) == CHUNK and chunk.more else Found(chunk, 0)
 
     def take(self, found: Found, most: int) -> bool:
         """Take what the file has after the end; whether something is new."""
@@ -113,7 +111,7 @@ class Tail:
         if chunk.replaced or chunk.start > self.end:
             self.restart(chunk.start)
         whole = chunk.data.rfind(b"\n") + 1
-        self.inside = not whole and len(chunk.data) == _READ
+        self.inside = not whole and len(chunk.data) == CHUNK
         self.identity = chunk.identity
         changed = self.push(chunk.start, chunk.data if self.inside else chunk.data[:whole], most)
         self.fed = self.fed and (not chunk.data or self.end > chunk.start + whole)

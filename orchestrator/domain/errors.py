@@ -15,10 +15,6 @@ class UsageError(ServerError):
     """An option or argument can't be used; the message says why and what to give instead."""
 
 
-class SpecError(Exception):
-    """A spec can't be used; the message is one line: file, line, key, what was expected."""
-
-
 class RequestError(Exception):
     """A request can't be carried out as it stands; nothing has changed."""
 
@@ -32,6 +28,10 @@ class ClientError(RequestError):
     def __init__(self, message: str, status: int = 400) -> None:
         super().__init__(message)
         self.status = status
+
+
+class SpecError(ClientError):
+    """A spec can't be used; the message is one line: file, line, key, what was expected."""
 
 
 class ApiError(Exception):

@@ -11,13 +11,12 @@ from typing import Any
 
 from orchestrator.domain.native_options import MalformedOptions, NativeOptions
 from orchestrator.domain.resources import Resources
+from orchestrator.domain.storable import DEEPEST_SPEC, not_storable
 
 MOST_NODES = 5000
 """Nodes of a gang from YAML; the Batch API takes AWS's 1,000."""
 LARGEST_DEFINITION = 24 << 10
 """Bytes of a job definition, as on AWS."""
-DEEPEST_SPEC = 100
-"""Levels of lists and mappings in a spec. A deeper one could be stored, but no answer could show it."""
 
 
 @dataclass(frozen=True)
@@ -103,26 +102,19 @@ class NodeSpec:
 
     @cached_property
     def spec(self) -> Mapping[str, Any] | None:
-        """The job YAML that the node reads; None where there is none. Raises ValueError."""
+        """The job YAML that the node reads; None where it has none. Raises MalformedOptions."""
         text = self.environment.get("MUSTER_SPEC")
         if not text:
             return None
         try:
             spec = json.loads(text)
-            if "\\u" in text:  # JSON can say half of a character, which no answer could repeat
-                json.dumps(spec, ensure_ascii=False).encode()
-            is_too_deep = text.count("[") + text.count("{") > DEEPEST_SPEC and _depth(spec) > DEEPEST_SPEC
         except (ValueError, RecursionError) as error:
-            raise ValueError(f"MUSTER_SPEC can't be read: {error}") from None
-        if (spec is not None and not isinstance(spec, dict)) or is_too_deep:
-            raise ValueError(f"MUSTER_SPEC is not a mapping of at most {DEEPEST_SPEC} levels")
+            raise MalformedOptions(f"MUSTER_SPEC can't be read: {error}") from None
+        if spec is not None and not isinstance(spec, dict):
+            raise MalformedOptions("MUSTER_SPEC is not a mapping")
+        if ("\\u" in text or text.count("[") + text.count("{") > DEEPEST_SPEC) and (problem := not_storable(spec)):
+            raise MalformedOptions(f"MUSTER_SPEC: {problem[1]}")
         return spec
-
-
-def _depth(value: object) -> int:
-    """Number of levels of nested lists and mappings. Raises RecursionError."""
-    inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    return 1 + max(map(_depth, inner), default=0)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ def checked_gang(node_properties: Mapping[str, Any]) -> CheckedGang:
     except MalformedOptions:
         raise ClientError(_MALFORMED) from None
     except ValueError as error:
-        raise ClientError(_MALFORMED if "MUSTER_SPEC" in str(error) else str(error)) from None
+        raise ClientError(str(error)) from None
     options = gang.options
     stall = options.stall_timeout
     if not LEAST_LOG_LIMIT <= options.log_limit < 2**63 or (stall is not None and not 0 < stall < math.inf):

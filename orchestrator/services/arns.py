@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 
 from orchestrator.control.account import DEFAULT, Account
 from orchestrator.domain.errors import ClientError
@@ -25,24 +26,17 @@ def _prefix(service: str = "batch") -> str:
     return f"arn:{_here.partition}:{service}:{_here.region}:{_here.id}:"
 
 
-def job_arn(job_id: str) -> str:
-    return f"{_prefix()}job/{job_id}"
+def _arn(kind: str, name: str) -> str:
+    return f"{_prefix()}{kind}/{name}"
+
+
+job_arn, queue_arn, policy_arn, compute_environment_arn = (
+    partial(_arn, kind) for kind in ("job", "job-queue", "scheduling-policy", "compute-environment")
+)
 
 
 def definition_arn(name: str, revision: int) -> str:
-    return f"{_prefix()}job-definition/{name}:{revision}"
-
-
-def queue_arn(name: str) -> str:
-    return f"{_prefix()}job-queue/{name}"
-
-
-def compute_environment_arn(name: str) -> str:
-    return f"{_prefix()}compute-environment/{name}"
-
-
-def policy_arn(name: str) -> str:
-    return f"{_prefix()}scheduling-policy/{name}"
+    return _arn("job-definition", f"{name}:{revision}")
 
 
 def ecs_arn(kind: str, environment: str, name: str = "") -> str:

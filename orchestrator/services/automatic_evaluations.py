@@ -66,7 +66,7 @@ class _Training:
     spec: Mapping[str, Any]
     queue: str
     directory: str
-    wanted: Evaluation
+    evaluation: Evaluation
 
 
 class AutomaticEvaluations:
@@ -77,7 +77,6 @@ class AutomaticEvaluations:
     ) -> None:
         """
         Args:
-            controller: The controller.
             actor_named: The actor of that name with the rights that it has now; None where its key is gone.
             interval: Seconds between two looks.
         """
@@ -137,7 +136,7 @@ class AutomaticEvaluations:
             body()
             self._backoff.worked(subject)
         except Unavailable:
-            pass  # said by the controller
+            pass  # which the controller reports
         except (OSError, ValueError, DamagedCheckpoint, PluginError) as error:
             self._backoff.failed(subject, f"automatic evaluations, {subject}: {' '.join(str(error).split())}")
         except Exception as error:
@@ -186,7 +185,7 @@ class AutomaticEvaluations:
                 return
             busy = row is not None and row.open
             before = _counted(row, training, checkpoints)
-        counted, chosen = due(checkpoints, before, training.wanted.every, iterations, busy)
+        counted, chosen = due(checkpoints, before, training.evaluation.every, iterations, busy)
         if chosen is not None and self._claimed(run, chosen):
             self._submit(training, counted, chosen)
         elif chosen is None and (row is None or row.training != job_id or counted != before):
@@ -204,14 +203,14 @@ class AutomaticEvaluations:
     def _read(self, job: Job) -> _Training | None:
         gang = job.gang
         try:
-            wanted = wanted_of(gang.spec)
+            evaluation = wanted_of(gang.spec)
         except SpecError as error:  # it was checked when it was submitted
             raise ValueError(str(error)) from None
-        if wanted is None or job.first_epoch is None:
+        if evaluation is None or job.first_epoch is None:
             return None
         owner, directory = job.owner or CONTROLLER.name, gang.options.directory
         run = self._controller.access.store.run(job.run)
-        return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, job.queue, directory, wanted)
+        return _Training(job.id, run, owner, job.first_epoch, gang.spec or {}, job.queue, directory, evaluation)
 
     @staticmethod
     def _claimed(run: Run, chosen: Checkpoint) -> bool:
@@ -234,8 +233,8 @@ class AutomaticEvaluations:
             actor = self._actor_named(training.owner)
             if actor is None:
                 raise ClientError(f"{training.owner}, which submitted the training, has no access any more")
-            place = place_of(training.queue, None, wanted_of(inherited(actor, training.spec)) or training.wanted)
-            spec = automatic_evaluation(run.name, training.spec, place, training.wanted, chosen.iteration)
+            place = place_of(training.queue, wanted_of(inherited(actor, training.spec)) or training.evaluation)
+            spec = automatic_evaluation(run.name, training.spec, place, training.evaluation, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 
             def call(known: Known) -> Job:
@@ -247,7 +246,7 @@ class AutomaticEvaluations:
                     return job
 
             job = commit_submission(controller, call)
-        except (ClientError, SpecError) as error:
+        except ClientError as error:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
             evaluation_is_over(run, chosen.name)
             self._note(training, counted, f"checkpoint {chosen.name} was not evaluated: {error}")

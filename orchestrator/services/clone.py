@@ -17,7 +17,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
@@ -37,7 +37,7 @@ from shared_store.contract.error_text import Refused, shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.volume.initial_weights import NewRun, RunExists, TeacherCopy
 from shared_store.volume.layout import Run
-from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.volume.run_settings import changed_setting, merged
 
 
 def clone(
@@ -46,14 +46,13 @@ def clone(
     """Submit a job whose run begins at iteration 0 with the weights of ``source``; refusals come before a job exists.
 
     Args:
-        controller: The controller.
         source: Whose weights.
         name: Of the new run, and of its job.
         changes: The changes of its spec, and the checkpoint.
         idempotency_key: A second call with it answers what the first one did.
 
     Raises:
-        ClientError: The source is no training, its checkpoint is missing or damaged, there is a run of the new name, a change is
+        ClientError: The source is not a training, its checkpoint is missing or damaged, there is a run of the new name, a change is
             impossible, or the weights can't fit what was changed.
     """
     with using(controller, source.name):
@@ -174,11 +173,8 @@ def _changed(session: Session, actor: Actor, source: FoundRun, name: str, change
     named = next((each for each in changes.assignments if each.partition("=")[0] == "name"), None)
     if named is not None:
         raise ClientError(f"--set {named[:100]}: a clone has the name that --name gives it")
-    try:
-        before = validate(document, f"run {source.name}", merged=False)
-        spec = validate(override(document, [*changes.all(), f"name={json.dumps(name)}"]), f"clone of run {source.name}")
-    except SpecError as error:
-        raise ClientError(str(error)) from None
+    before = validate(document, f"run {source.name}", merged=False)
+    spec = validate(override(document, [*changes.all(), f"name={json.dumps(name)}"]), f"clone of run {source.name}")
     for which in (before, spec):
         if which.train is None:
             what = f"run {source.name} is" if which is before else "the changes make it"
@@ -214,32 +210,30 @@ def _check_weights(source: Run, chosen: Checkpoint, spec: Spec) -> None:
                 "or with a module:Class of your own whose load_state_dict reads them"
             )
         return  # whether a class of the user's own reads them, or is read, only the rank can say
-    settings, given = manifest["settings"], spec.train.overrides()
-    fixed = fixed_settings(ALGORITHMS.get(name), settings, of_clone=True)
-    asked = [key for key in fixed if setting_at(given, key) is not None]
-    if difference := first_difference(settings, given, asked):
-        key, there, here = innermost(*difference)
+    settings, own = manifest["settings"], spec.train.overrides()
+    if changed := changed_setting(ALGORITHMS.get(name), settings, merged(settings, own), settings, of_clone=True):
+        key, old, new, _ = changed
         raise ClientError(
-            f"{where} was learnt with train.{name}.{key} {shown(there)} and does not fit {shown(here)}; leave the setting out"
+            f"{where} was trained with train.{name}.{key} {shown(old)}, which can't become {shown(new)}; leave the setting out"
         )
     if name in ALGORITHMS and (misfit := _of_other_size(manifest, spec.train)):
-        key, there, here = misfit
+        key, then, now = misfit
         raise ClientError(
-            f"{where} was learnt with train.config.{key}: {there}, and the clone would have {here}, for which its network has another "
-            "size; leave the setting as it is, or submit a new training"
+            f"{where} was trained with train.config.{key}: {then}; with {now}, as in the clone, its network has another size: "
+            "leave the setting as it is, or submit a new training"
         )
 
 
 def _of_other_size(manifest: Mapping[str, Any], train: Train) -> tuple[str, str, str] | None:
-    """The first setting of an installed task for which the policy has another size than in a checkpoint: its key, there, here."""
+    """The first setting of an installed task for which the policy has another size than in a checkpoint: its key, then and now."""
     kind, learnt = task_config(train.task), manifest.get("train")
     if kind is None or not isinstance(learnt, dict) or manifest.get("task") != train.task:
         return None
     try:
-        there, here = (kind.configured(config or {}).policy_sizes for config in (learnt.get("config"), train.config))
+        then, now = (kind.configured(config or {}).policy_sizes for config in (learnt.get("config"), train.config))
     except Refused:  # of what another version has written
         return None
-    return next(((key, there[key], here[key]) for key in there if key in here and there[key] != here[key]), None)
+    return next(((key, then[key], now[key]) for key in then if key in now and then[key] != now[key]), None)
 
 
 _EXISTS = "run {} exists already: give the clone another --name"

@@ -17,7 +17,14 @@ from orchestrator.control.run_store import ObservedRun, facts_of
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ClientError, RequestError
 from orchestrator.domain.job import Status
-from orchestrator.persistence.batch_models import Job, JobDefinition, JobQueue, RunRecord
+from orchestrator.persistence.batch_models import (
+    ComputeEnvironment,
+    Job,
+    JobDefinition,
+    JobQueue,
+    RunRecord,
+    SchedulingPolicy,
+)
 from orchestrator.persistence.ownership import owner_of
 from orchestrator.persistence.queries import find_job
 from orchestrator.services.arns import plain_name
@@ -32,6 +39,8 @@ _COMPARED = 1000
 
 
 T = TypeVar("T")
+Row = TypeVar("Row", ComputeEnvironment, SchedulingPolicy)
+_KINDS: dict[type, str] = {ComputeEnvironment: "Compute environment", SchedulingPolicy: "Scheduling policy"}
 Known = dict[Hashable, Callable[[], Any]]
 """What was read of the store, by key: each returns it, or raises what the read raised."""
 
@@ -109,12 +118,19 @@ class Context:
         run = self.run(name)
         return self.read(("run", name), lambda: facts_of(run))
 
+    def named(self, kind: type[Row], reference: str) -> Row:
+        """The row of this name or ARN. Raises ClientError."""
+        words = _KINDS[kind]
+        if (row := self.session.get(kind, plain_name(reference, words.lower().replace(" ", "-")))) is None:
+            raise ClientError(f"{words} {reference[:300]} does not exist")
+        return row
+
     def queue(self, reference: str, *, deleting: bool = False) -> JobQueue:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
         queue = self.session.get(JobQueue, plain_name(reference, "job-queue"))
         if queue is None or (queue.deleting and not deleting):
-            there = ", ".join(queue_names(self.session, self.actor)[:5]) or "none yet"
-            raise ClientError(f"Job queue {reference[:300]} does not exist; there is {there}")
+            available = ", ".join(queue_names(self.session, self.actor)[:5]) or "none yet"
+            raise ClientError(f"Job queue {reference[:300]} does not exist; there is {available}")
         return queue
 
     def definition(self, reference: str) -> JobDefinition:
@@ -266,17 +282,15 @@ def visible_runs(
     """The runs of the store that the actor may see, by name.
 
     Args:
-        controller: The controller.
-        actor: Who asks.
         after: Those behind this name.
         most: At most so many.
         search: Those with this text in their names.
         among: Those of which this is true; it may read the store.
     """
     restricted = actor.queues is not None
-    wanted = search.lower()
+    part = search.lower()
     found = controller.access.store.runs(
-        after, None if restricted else most, lambda run: wanted in run.name.lower() and among(run)
+        after, None if restricted else most, lambda run: part in run.name.lower() and among(run)
     )
     if not restricted:
         return found

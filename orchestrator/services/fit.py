@@ -8,7 +8,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.snapshot import fit_in_queue
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.scheduling.fit import Fit
@@ -30,8 +30,8 @@ class UnknownQueue(ClientError):
     """A request names a queue that does not exist; ``known``: those that the caller may see."""
 
     def __init__(self, name: str, known: Sequence[str], status: int = 400) -> None:
-        there = ", ".join(known[:10]) or "none"
-        super().__init__(f"there is no queue {name[:100]!r}; there is {there}", status)
+        available = ", ".join(known[:10]) or "none"
+        super().__init__(f"there is no queue {name[:100]!r}; there is {available}", status)
 
 
 def named_queue(session: Session, actor: Actor, name: str) -> JobQueue:
@@ -47,13 +47,13 @@ def _problem_of_evaluations(
 ) -> str | None:
     """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
     try:
-        wanted = wanted_of(gang.spec)
-        if wanted is None:
+        evaluation = wanted_of(gang.spec)
+        if evaluation is None:
             return None
-        place = place_of(queue.name, None, wanted)
-        spec = automatic_evaluation("run", gang.spec or {}, place, wanted, 1)
+        place = place_of(queue.name, evaluation)
+        spec = automatic_evaluation("run", gang.spec or {}, place, evaluation, 1)
         definition = compile_definition(spec, gang.options.directory)
         shape = gang_needs(definition["nodeProperties"]).shape
         return fit_in_queue(session, controller.engines, named_queue(session, actor, place["queue"]), shape).problem
-    except (ClientError, SpecError) as error:
+    except ClientError as error:
         return str(error)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from orchestrator.domain.errors import ClientError, ServerError
 from orchestrator.persistence.access_keys import Key, KeyStore, KeyUsageError
 from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.permissions import Actor, Operation, Refusal, Shared
 
-T = TypeVar("T")
-
 
 def listed(keys: KeyStore | None, actor: Actor) -> list[Key]:
     """All keys, by name. Raises ClientError."""
-    actor.check_all_queues(Operation.READ_KEYS)
-    return sorted(_carried_out(_there(keys).load).values(), key=lambda key: key.name)
+    with _checked(keys, actor, Operation.READ_KEYS) as store:
+        return sorted(store.load().values(), key=lambda key: key.name)
 
 
 def create(
@@ -33,7 +31,6 @@ def create(
 
     Args:
         keys: Where it is kept; None for a server without keys.
-        actor: Who asks.
         name: Of the key.
         queues: Names of the queues that it may use; all where empty.
         read_only: Whether it may change nothing.
@@ -44,36 +41,32 @@ def create(
         ClientError: A name can't be used, or the secret can't be sealed.
         Refusal: The actor may not make keys, or not here.
     """
-    _check(actor, Operation.CREATE_KEY, reachable)
-    return _carried_out(lambda: _there(keys).create(name, queues, read_only, share))
+    with _checked(keys, actor, Operation.CREATE_KEY, reachable) as store:
+        return store.create(name, queues, read_only, share)
 
 
 def delete(keys: KeyStore | None, actor: Actor, name: str, *, reachable: bool) -> None:
     """Delete the key of this name; as :func:`create`."""
-    _check(actor, Operation.DELETE_KEY, reachable)
-    _carried_out(lambda: _there(keys).delete(name))
+    with _checked(keys, actor, Operation.DELETE_KEY, reachable) as store:
+        store.delete(name)
 
 
-def _there(keys: KeyStore | None) -> KeyStore:
-    if keys is None:
-        raise ClientError("this server has no keys", 404)
-    return keys
-
-
-def _check(actor: Actor, operation: Operation, reachable: bool) -> None:
+@contextmanager
+def _checked(keys: KeyStore | None, actor: Actor, operation: Operation, reachable: bool = False) -> Iterator[KeyStore]:
+    """A block that uses the keys, where the actor may do this; their errors are ClientErrors in it. Raises ClientError, Refusal."""
     actor.check(operation, Shared())
+    if operation.reads:
+        actor.check_all_queues(operation)
     if reachable:
         command = "create" if operation is Operation.CREATE_KEY else "delete"
         raise Refusal(
             "AccessDeniedException",
-            f"other machines can reach this server, so keys are made and deleted on its own one alone: muster keys {command} NAME",
+            f"other machines can reach this server, so keys are created and deleted on its own machine alone: muster keys {command} NAME",
         )
-
-
-def _carried_out(body: Callable[[], T]) -> T:
-    """Raises ClientError for a name that can't be used, and for the sealing key's errors."""
+    if keys is None:
+        raise ClientError("this server has no keys", 404)
     try:
-        return body()
+        yield keys
     except KeyUsageError as error:
         raise ClientError(str(error)) from None
     except ServerError as error:

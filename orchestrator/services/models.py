@@ -21,18 +21,16 @@ def register(
     actor: Actor,
     run_name: str,
     name: str,
-    wanted: int | Literal["best", "latest"] | None = None,
+    requested: int | Literal["best", "latest"] | None = None,
     *,
     again: bool = False,
 ) -> Model:
     """Keep the exported bundle of a checkpoint as the next version of a model.
 
     Args:
-        controller: The controller.
-        actor: Who asks.
         run_name: The run of the checkpoint.
         name: Of the model.
-        wanted: Iteration of the checkpoint, ``best`` or ``latest``; the newest where None.
+        requested: Iteration of the checkpoint, ``best`` or ``latest``; the newest where None.
         again: Register a checkpoint that is a version of the model already.
 
     Raises:
@@ -42,26 +40,24 @@ def register(
     controller.writes.check(adds=True)
     if shortage := controller.access.shortage():
         raise ClientError(f"{shortage}; a model has a copy of its bundle", 503)
-    checkpoint = choose(run, wanted)
+    checkpoint = choose(run, requested)
     if checkpoint is None:
         raise ClientError(f"run {run.name} has no checkpoint yet, so there is no policy to register", CONFLICT)
     record = owner_of_run(controller, run)
     queue, owner = (record.queue, record.owner) if record else ("", None)
     try:
         with using(controller, run.name):
-            there = models.versions(controller.access.store, name)
-            if there:
-                actor.check(Operation.REGISTER_MODEL, owner_of_model(there[-1]))
+            existing = models.versions(controller.access.store, name)
+            if existing:
+                actor.check(Operation.REGISTER_MODEL, owner_of_model(existing[-1]))
             facts = {"queue": queue, "owner": owner, "registered_by": actor.name}
             return models.register(
                 controller.access.store, name, run, checkpoint, facts, controller.access.peers.id, again=again
             )
-    except AlreadyRegistered as error:
+    except (AlreadyRegistered, DamagedBundle, DamagedFile) as error:
         raise ClientError(str(error), CONFLICT) from None
     except ModelError as error:
         raise ClientError(str(error)) from None
-    except (DamagedBundle, DamagedFile) as error:
-        raise ClientError(str(error), CONFLICT) from None
     except OSError as error:
         raise ClientError(f"model {name} can't be written ({error.strerror or error})", 503) from None
 

@@ -211,7 +211,7 @@ class Actor:
     def check_all_queues(self, operation: Operation | AddedOperation) -> None:
         """Raise Refusal unless the actor may see all queues in one answer."""
         if self.queues is not None:
-            raise self._refusal(operation, "it tells of all queues")
+            raise self._refusal(operation, "it concerns all queues")
 
     def may_see(self, thing: Object) -> bool:
         """Whether the actor may read all of it; lists leave out the rest."""
@@ -224,7 +224,8 @@ class Actor:
     def _refusal(self, operation: Operation | AddedOperation, why: str) -> Refusal:
         queues = ", ".join(sorted(self.queues or ())) or "none"
         return Refusal(
-            "AccessDeniedException", f"{self.name} may use job queue {queues} only: {operation} is refused, since {why}"
+            "AccessDeniedException",
+            f"{self.name} is not authorized for {operation} (the key is limited to job queue {queues}): {why}",
         )
 
 

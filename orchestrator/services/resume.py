@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
 from orchestrator.control.run_store import facts_of
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import FoundRun
 from orchestrator.services import submission
@@ -32,7 +32,7 @@ from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, Newer
 from shared_store.volume.contents import is_archived
 from shared_store.volume.initial_weights import TeacherCopy
 from shared_store.volume.layout import Run
-from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.volume.run_settings import changed_setting, changed_task, setting_at
 
 _RATES = {"ppo": ("learning_rate", ", or train.ppo.schedule=fixed"), "rsl_rl": ("algorithm.learning_rate", "")}
 """Of each algorithm that adapts a learning rate: which setting is the first one, and what else helps who wants it back."""
@@ -50,7 +50,6 @@ def resume(
     """Submit a job that continues ``run``; everything that can be refused is refused before a job exists.
 
     Args:
-        controller: The controller.
         run: The run.
         changes: The changes. The run keeps its worlds; another number of nodes shares them anew.
         idempotency_key: A second call with it answers what the first one did.
@@ -84,7 +83,7 @@ def _resume(
         if earlier := _answered(Context(session, controller, actor, idempotency_key), record, found, checkpoints):
             return earlier
         document = spec_of(session, actor, found)
-    with suppress(SpecError, ClientError):  # refused below, with its reason
+    with suppress(ClientError):  # refused below, with its reason
         document = override(document or {}, changes.all())
     keep_again(controller, actor, run, document)
     chosen = choose(run, changes.checkpoint)
@@ -108,13 +107,10 @@ def _resume(
                     f"run {run.name} was not started from a YAML spec: submit its definition again with MUSTER_RUN={run.name}"
                 )
             document = inherited(actor, document)
-            try:
-                before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
-                changed = override(document, changes.all())
-                _check_algorithm(run, before, changed)
-                spec = validate(changed, f"run {run.name}")
-            except SpecError as error:
-                raise ClientError(str(error)) from None
+            before = validate(document, f"run {run.name}", merged=False)  # the changes may mend it
+            changed = override(document, changes.all())
+            _check_algorithm(run, before, changed)
+            spec = validate(changed, f"run {run.name}")
             _check_changes(run, before, spec)
             environment = {"MUSTER_RUN": run.name}
             if spec.train:
@@ -170,22 +166,15 @@ def _check_changes(run: Run, before: Spec, after: Spec) -> None:
         if before.kind != after.kind:
             raise ClientError(f"run {run.name} is a {before.kind} job; it can't continue as {after.kind}")
         return
-    may_change = getattr(task_config(after.train.task), "may_change", ())
-    was, wanted = (
-        {**dict(train), "config": {key: value for key, value in (train.config or {}).items() if key not in may_change}}
-        for train in (before.train, after.train)
-    )
-    if difference := first_difference(was, wanted, ("task", "algorithm", "seed", "config")):
-        key, old, new = innermost(*difference)
+    if difference := changed_task(task_config(after.train.task), dict(before.train), dict(after.train)):
+        key, old, new = difference
         raise ClientError(
             f"run {run.name}: train.{key} is {_shown(old)} and can't become {_shown(new)}; start a new run for that: "
             f"muster clone {run.name} --name NEW begins one with its weights"
         )
     name = after.train.algorithm
-    kind = ALGORITHMS.get(name)
-    if difference := first_difference(before.train.overrides(), after.train.overrides(), fixed_settings(kind)):
-        may = difference[0] not in fixed_settings(kind, of_clone=True)
-        key, *values = innermost(*difference)
+    if changed := changed_setting(ALGORITHMS.get(name), before.train.overrides(), after.train.overrides()):
+        key, *values, may = changed
         old, new = ("not set" if value is None else shown(value) for value in values)
         raise ClientError(
             f"run {run.name}: train.{name}.{key} is {old} and can't become {new}: it is part of what the run has learnt; "
@@ -204,20 +193,20 @@ def _check_rate(run: Run, chosen: Checkpoint, after: Spec, assignments: Sequence
         return
     name = after.train.algorithm
     key, hint = _RATES[name]
-    asked = setting_at(override({}, assignments), f"train.{name}.{key}")  # whatever section the assignment gives whole
-    if asked is None or (name == "ppo" and after.train.overrides().get("schedule") == "fixed"):
+    requested = setting_at(override({}, assignments), f"train.{name}.{key}")  # whatever section holds the assignment
+    if requested is None or (name == "ppo" and after.train.overrides().get("schedule") == "fixed"):
         return
     try:
         saved = chosen.manifest
     except DamagedCheckpoint:
         return  # the worker uses the one before
     rate = saved.get("learning_rate")
-    if not isinstance(asked, int | float) or not isinstance(rate, int | float):
+    if not isinstance(requested, int | float) or not isinstance(rate, int | float):
         return
-    differs = setting_at(saved, f"train.{name}.{key}") != asked  # then it counts
-    if not differs and not math.isclose(rate, asked, rel_tol=1e-6):  # a rate may be a float32
+    differs = setting_at(saved, f"train.{name}.{key}") != requested  # then it counts
+    if not differs and not math.isclose(rate, requested, rel_tol=1e-6):  # a rate may be a float32
         raise ClientError(
-            f"run {run.name}: train.{name}.{key} is {asked!r} already, so that the run would continue with "
+            f"run {run.name}: train.{name}.{key} is {requested!r} already, so that the run would continue with "
             f"the rate of its checkpoint, which is {rate:.3g} now; set another value{hint}"
         )
 
@@ -248,15 +237,15 @@ def _worlds(session: Session, actor: Actor, run: FoundRun, before: Spec, after: 
     """Number of worlds with which the run continues: those that it has, whatever the number of ranks. Raises ClientError where they don't fit."""
     assert before.train is not None and after.train is not None
     ranks = after.nodes.max * after.ranks_per_node
-    wanted = after.train.worlds * ranks
+    total = after.train.worlds * ranks
     changed = before.train.worlds != after.train.worlds
     if changed and chosen is None:  # no checkpoint holds worlds yet
-        return wanted
+        return total
     worlds = _worlds_of(session, actor, run, before, chosen)
-    if changed and wanted != worlds:
+    if changed and total != worlds:
         assert chosen is not None
         raise ClientError(
-            f"run {run.name}: checkpoint {chosen.name} holds {counted(worlds, 'world')}, this job would have {wanted} "
+            f"run {run.name}: checkpoint {chosen.name} holds {counted(worlds, 'world')}, this job would have {total} "
             f"({counted(after.nodes.max, 'node')} × {counted(after.ranks_per_node, 'rank')} × {after.train.worlds}); "
             "leave train.worlds as it is: the worlds are distributed over all ranks"
         )
@@ -271,10 +260,10 @@ def _worlds_of(session: Session, actor: Actor, run: FoundRun, before: Spec, chos
     """Number of worlds of the run, by its checkpoint, else by its newest job's variables or spec."""
     assert before.train is not None
     try:
-        if chosen and isinstance(told := chosen.manifest.get("worlds"), int):
-            return told
+        if chosen and isinstance(saved := chosen.manifest.get("worlds"), int):
+            return saved
     except DamagedCheckpoint:
         pass
-    if (newest := newest_job(session, actor, run)) and (given := newest.gang.options.worlds) is not None:
-        return given
+    if (newest := newest_job(session, actor, run)) and (distributed := newest.gang.options.worlds) is not None:
+        return distributed
     return before.train.worlds * before.ranks_per_node * before.nodes.max

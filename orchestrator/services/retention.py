@@ -57,8 +57,6 @@ def next_part(controller: Controller, actor: Actor, after: str, older_than: str,
     """The next part of a pass over the actor's jobs and runs.
 
     Args:
-        controller: The controller.
-        actor: Who asks.
         after: ``next`` of the part before; empty at first.
         older_than: Age in place of the rules' default, such as ``30d``; empty as the rules say.
         take: Whether to take what the rules let go, rather than only to name it.

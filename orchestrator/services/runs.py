@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +26,9 @@ from shared_store.volume.evaluations import by_checkpoint
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import sampled
+
+_KEPT = 600.0
+"""Seconds for which the parent of a run is not read again: it changes only where the run is replaced by another of its name."""
 
 
 def list_runs(
@@ -198,3 +203,35 @@ def _automatic(session: Session, actor: Actor, run: FoundRun) -> dict[str, Any] 
         "passed": row.passed,
         "problem": row.problem,
     }
+
+
+def clones_of(controller: Controller, actor: Actor, run: Run) -> list[str]:
+    """The runs that began with weights of ``run`` and that the caller may see, by name."""
+    return [each.name for each in visible_runs(controller, actor) if _parents.of(each) == run.name]
+
+
+class _Parents:
+    """The parent of each run, read once in ten minutes. Any thread may call."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._known: dict[str, tuple[float, str | None]] = {}
+
+    def of(self, run: Run) -> str | None:
+        """The name of a run's parent; None where it has none, or can't be read."""
+        key, now = str(run.path), time.monotonic()
+        with self._lock:
+            known = self._known.get(key)
+        if known is not None and now - known[0] < _KEPT:
+            return known[1]
+        try:
+            parent = ((run.description() or {}).get("parent") or {}).get("run")
+        except (DamagedFile, OSError):
+            return None
+        parent = parent if isinstance(parent, str) else None
+        with self._lock:
+            self._known[key] = now, parent
+        return parent
+
+
+_parents = _Parents()

@@ -15,10 +15,9 @@ from orchestrator.domain.gang import GangSpec, NodeSpec
 from orchestrator.persistence.batch_models import RunRecord
 from orchestrator.persistence.own_models import RunUse
 from orchestrator.persistence.ownership import owner_of
+from orchestrator.services.chosen_checkpoints import check_evaluation, check_task, check_training
 from orchestrator.services.context import Context, archived, permitted_run, release
-from orchestrator.services.evaluated_checkpoints import check_evaluation, check_task
 from orchestrator.services.permissions import Operation
-from orchestrator.services.stored_names import check_training
 from shared_store.contract import plugins
 from shared_store.contract.error_text import shown
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
@@ -118,7 +117,6 @@ def with_teacher(controller: Controller, submit: Callable[[TeacherCopy | None], 
     Raises ClientError.
 
     Args:
-        controller: The controller.
         submit: Submits it with a copy, or raises :class:`TeacherNeeded`.
     """
     try:
@@ -193,9 +191,9 @@ def _checkpoint(run: Run, source: SourceRun) -> Checkpoint:
         raise ClientError(f"{source.key}: run {source.run} has no checkpoint yet; train it first")
     meant = [checkpoint for checkpoint in checkpoints if _is_meant(checkpoint, source)]
     if not meant:
-        there = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints)
+        available = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints)
         raise ClientError(
-            f"{source.key}: run {source.run} has no checkpoint of iteration {source.checkpoint}; it has: {there}"
+            f"{source.key}: run {source.run} has no checkpoint of iteration {source.checkpoint}; it has: {available}"
         )
     return meant[-1]
 
@@ -209,12 +207,12 @@ def _sources(node: NodeSpec) -> Iterator[SourceRun]:
         section = sections.get(kind)
         if isinstance(section, dict) and isinstance(section.get("run"), str):
             yield SourceRun(section["run"], kind)
-    given: Any = sections
+    value: Any = sections
     for part in _TEACHER.split("."):
-        given = given.get(part) if isinstance(given, dict) else None
-    if given is not None:
-        found = re.fullmatch(rf"({NAME.pattern})(?:@([0-9]{{1,8}}|[0-9]{{8}}-e[0-9]{{1,18}}))?", str(given))
+        value = value.get(part) if isinstance(value, dict) else None
+    if value is not None:
+        found = re.fullmatch(rf"({NAME.pattern})(?:@([0-9]{{1,8}}|[0-9]{{8}}-e[0-9]{{1,18}}))?", str(value))
         if found is None:
-            raise ClientError(f"{_TEACHER}: expected RUN or RUN@ITERATION, found {shown(given)}")
+            raise ClientError(f"{_TEACHER}: expected RUN or RUN@ITERATION, found {shown(value)}")
         iteration = found[2] or ""
-        yield SourceRun(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration, str(given))
+        yield SourceRun(found[1], _TEACHER, str(int(iteration)) if iteration.isdecimal() else iteration, str(value))

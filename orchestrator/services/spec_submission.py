@@ -17,13 +17,13 @@ from orchestrator.domain.gang import LARGEST_DEFINITION, GangSpec
 from orchestrator.domain.gang_checks import checked_gang
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Job, JobQueue
-from orchestrator.services import definitions, submission
+from orchestrator.services import submission
+from orchestrator.services.chosen_checkpoints import check_training
 from orchestrator.services.context import Context, Known, with_store
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import Actor, JobsOf, Operation
 from orchestrator.services.runs import newest_job
 from orchestrator.services.sources import with_teacher
-from orchestrator.services.stored_names import check_training
 from orchestrator.services.submission import Submission, record_of
 from orchestrator.spec.compile import compile_definition, long_texts, with_environment
 from orchestrator.spec.model import Spec
@@ -138,7 +138,6 @@ def submit(
     """Register the definition, where the newest of its name is another one, and submit the job; nothing is committed.
 
     Args:
-        context: The call.
         spec: Of the job.
         directory: Its working directory.
         what: Begins the words of a refusal; empty where the spec is the caller's own, who then learns what to change.
@@ -158,7 +157,7 @@ def submit(
     if environment:
         properties = with_environment(properties, environment)
     gang = checked_gang(properties)
-    definition = definitions.revision(context, spec.name, document, gang, again=False)
+    definition = submission.revision(context, spec.name, document, gang, again=False)
     context.actor.check(Operation.SUBMIT_JOB, definition)
     _check_fit(context, spec, queue, gang, what)
     retry, timeout = document["retryStrategy"], document.get("timeout") or {}

@@ -23,7 +23,6 @@ def end(context: Context, job_id: str, reason: str, operation: Operation, *, onl
     """Ask a job to end, of an array its children too; nothing is committed. One that has ended stays as it is.
 
     Args:
-        context: The call.
         job_id: Of the job.
         reason: At most LONGEST_REASON characters.
         operation: For which the actor needs the permission.

@@ -16,7 +16,7 @@ from sqlalchemy.orm import Session
 
 from orchestrator.control.compute_environments import queue_engines
 from orchestrator.domain import reasons
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.gang_checks import CheckedGang
 from orchestrator.domain.identifiers import SHARE
@@ -170,7 +170,7 @@ def open_queue(context: Context, queue: JobQueue, share: str | None, priority: i
     return share
 
 
-def submit(context: Context, wanted: Submission) -> Job:
+def submit(context: Context, submitted: Submission) -> Job:
     """Submit a job; nothing is committed.
 
     Raises:
@@ -178,19 +178,19 @@ def submit(context: Context, wanted: Submission) -> Job:
         StoreNeeded: Something has to be read of the store first (:func:`.context.with_store`).
         TeacherNeeded: Its teacher's weights have to be copied first (:func:`.sources.with_teacher`).
     """
-    gang = wanted.gang
-    _check_commands(context, wanted)
-    _check_secrets(context, wanted.queue, gang)
+    gang = submitted.gang
+    _check_commands(context, submitted)
+    _check_secrets(context, submitted.queue, gang)
     log_groups.check_room(context.session, gang.log_groups, context.actor.name)
-    job = _row(context, wanted)
-    _check_automatic(context, wanted)
+    job = _row(context, submitted)
+    _check_automatic(context, submitted)
     check_texts(context, gang)
-    teacher = check_sources(context, gang, bool(wanted.waits))
+    teacher = check_sources(context, gang, bool(submitted.waits))
     job.idempotency_key = _scoped(context)
-    if wanted.array is not None:
-        _add_array(context, job, wanted.array, wanted.waits)
+    if submitted.array is not None:
+        _add_array(context, job, submitted.array, submitted.waits)
     else:
-        job.dependencies.extend(Dependency(on_id=each.on, kind=each.kind) for each in wanted.waits)
+        job.dependencies.extend(Dependency(on_id=each.on, kind=each.kind) for each in submitted.waits)
         _release(job)
         if teacher:
             hold_teacher(context, job.run, teacher)
@@ -200,46 +200,43 @@ def submit(context: Context, wanted: Submission) -> Job:
     return job
 
 
-def _row(context: Context, wanted: Submission) -> Job:
+def _row(context: Context, submitted: Submission) -> Job:
     copy = context.making or context.teacher
     job_id = copy.job if copy else str(uuid.uuid4())  # the same in each try: its run may have the copy already
-    named = wanted.gang.options.run
-    run = named or f"{wanted.name[:110]}-{job_id[:8]}"
+    named = submitted.gang.options.run
+    run = named or f"{submitted.name[:110]}-{job_id[:8]}"
     _check_run(context, run, bool(named))
-    definition = wanted.definition
+    definition = submitted.definition
     job = Job(
         id=job_id,
-        name=wanted.name,
-        queue=wanted.queue.name,
+        name=submitted.name,
+        queue=submitted.queue.name,
         owner=context.actor.name,
         definition=definition_arn(definition.name, definition.revision),
-        kind="array" if wanted.array is not None else definition.document["type"],
-        request=wanted.record,
-        node_properties=wanted.properties,
-        from_yaml=wanted.gang.spec is not None,
+        kind="array" if submitted.array is not None else definition.document["type"],
+        request=submitted.record,
+        node_properties=submitted.properties,
+        from_yaml=submitted.gang.spec is not None,
         run=run,
-        attempts_allowed=wanted.attempts,
-        evaluate_on_exit=list(wanted.evaluate_on_exit),
-        timeout=wanted.timeout,
-        share=wanted.share,
-        priority=wanted.priority,
-        parameters=dict(wanted.parameters or {}),
-        tags=dict(wanted.tags or {}),
+        attempts_allowed=submitted.attempts,
+        evaluate_on_exit=list(submitted.evaluate_on_exit),
+        timeout=submitted.timeout,
+        share=submitted.share,
+        priority=submitted.priority,
+        parameters=dict(submitted.parameters or {}),
+        tags=dict(submitted.tags or {}),
         created_at=now(),
     )
-    gangs.remember(job.id, wanted.properties, wanted.gang)
+    gangs.remember(job.id, submitted.properties, submitted.gang)
     return job
 
 
-def _check_automatic(context: Context, wanted: Submission) -> None:
+def _check_automatic(context: Context, submitted: Submission) -> None:
     """Raise ClientError where the actor could not submit the evaluations of this training."""
-    try:
-        evaluation = wanted_of(wanted.gang.spec)
-    except SpecError as error:
-        raise ClientError(str(error)) from None
+    evaluation = wanted_of(submitted.gang.spec)
     if evaluation is None:
         return
-    place = place_of(wanted.queue.name, wanted.share, evaluation)
+    place = place_of(submitted.queue.name, evaluation, submitted.share)
     try:
         open_queue(context, context.queue(place["queue"]), place.get("share"))
     except permissions.Refusal:
@@ -248,16 +245,16 @@ def _check_automatic(context: Context, wanted: Submission) -> None:
         raise ClientError(f"evaluation: {error}", error.status) from None
 
 
-def _check_commands(context: Context, wanted: Submission) -> None:
+def _check_commands(context: Context, submitted: Submission) -> None:
     """A node without a command runs that of its image, where its engine runs images. Raises ClientError."""
-    open_node = next((node for node in wanted.gang.nodes if not node.command), None)
+    open_node = next((node for node in submitted.gang.nodes if not node.command), None)
     if open_node is None:
         return
-    engine, queue, definition = context.controller.engines, wanted.queue.name, wanted.definition
+    engine, queue, definition = context.controller.engines, submitted.queue.name, submitted.definition
     if without := engine.without_images(queue_engines(context.session, queue, engine.names[0])):
         where = f"job definition {definition.name}"
         if definition.document["type"] == "multinode":
-            ranges = wanted.properties["nodeRangeProperties"]
+            ranges = submitted.properties["nodeRangeProperties"]
             target = next(each["targetNodes"] for each in ranges if each["container"] is open_node.container)
             where = f"node range {target[:20]} of {where}"
         raise ClientError(
@@ -297,12 +294,14 @@ def _check_run(context: Context, run: str, named: bool) -> None:
         raise ClientError(
             f"run {run} is being written by job {reasons.named(holder.name, holder.id)}; stop it first: muster stop {reasons.short_id(holder.id)}"
         )
-    with contextlib.suppress(OSError, ValueError):  # a store that is away, or damaged: the job's own reason says it
-        there, version = context.run(run), context.controller.access.users.version(run)
+    with contextlib.suppress(
+        OSError, ValueError
+    ):  # a store that is unavailable, or damaged: the job's own reason explains it
+        target, version = context.run(run), context.controller.access.users.version(run)
         if not named:
             return
         writer, is_kept = context.read(
-            ("writer", run, version), lambda: (context.controller.access.peers.writer(there), is_archived(there))
+            ("writer", run, version), lambda: (context.controller.access.peers.writer(target), is_archived(target))
         )
         if writer:
             raise ClientError(f"run {run} is being written by {writer}; stop that job first")
@@ -394,3 +393,43 @@ def _numbers(numbers: range) -> ColumnElement[int]:
     step = select(first.c.number + 1).where(first.c.number < numbers.stop - 1)
     column: ColumnElement[int] = first.union_all(step).c.number
     return column
+
+
+def revision(
+    context: Context,
+    name: str,
+    document: Mapping[str, Any],
+    gang: GangSpec,
+    tags: Mapping[str, str] | None = None,
+    *,
+    again: bool = True,
+) -> JobDefinition:
+    """A revision of a definition, to be added to the session.
+
+    Args:
+        name: Of the definition.
+        document: The request of RegisterJobDefinition, without tags.
+        gang: What the document asks for.
+        tags: Of the definition.
+        again: Whether a document that is the newest revision already becomes a revision of its own, as on AWS.
+
+    Raises:
+        ClientError: The store lacks a text that the document names.
+        StoreNeeded: Something has to be read of the store first (:func:`.context.with_store`).
+    """
+    context.actor.check(Operation.REGISTER_JOB_DEFINITION)
+    check_texts(context, gang)
+    of_name = select(JobDefinition).where(JobDefinition.name == name).order_by(JobDefinition.revision.desc()).limit(1)
+    if not again:
+        own = context.session.scalars(of_name.where(JobDefinition.owner == context.actor.name)).first()
+        if own and own.status == "ACTIVE" and own.document == document and own.tags == (tags or {}):
+            return own
+    newest = context.session.scalars(of_name).first()
+    return JobDefinition(
+        name=name,
+        revision=newest.revision + 1 if newest else 1,
+        document=dict(document),
+        owner=context.actor.name,
+        status="ACTIVE",
+        tags=dict(tags or {}),
+    )

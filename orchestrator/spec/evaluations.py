@@ -66,8 +66,8 @@ def wanted_of(spec: Mapping[str, Any] | None) -> Evaluation | None:
         raise SpecError(f"{key}: {explain(first)}") from None
 
 
-def place_of(queue: str, share: str | None, wanted: Evaluation) -> dict[str, str]:
-    """Queue and share of a training's automatic evaluations: the training's, which are given, unless the section names a queue."""
+def place_of(queue: str, wanted: Evaluation, share: str | None = None) -> dict[str, str]:
+    """Queue and share of a training's automatic evaluations: ``queue`` and ``share``, the training's, unless the section names a queue."""
     asked = {"queue": wanted.queue, "share": wanted.share}
     if wanted.queue is None:
         asked = {"queue": queue, "share": wanted.share or share}

@@ -25,6 +25,7 @@ from pydantic import (
 )
 
 from orchestrator.domain.errors import SpecError
+from orchestrator.domain.storable import Problem, not_finite, not_storable
 from orchestrator.spec.sections import (
     ACCEPT,
     CheckpointPolicy,
@@ -37,7 +38,6 @@ from orchestrator.spec.sections import (
     Share,
 )
 from orchestrator.spec.settings import effective_problem, section_of, settings_classes, task_config, train_section
-from orchestrator.spec.storable import Problem, not_finite, not_storable
 from orchestrator.spec.tracking_services import TrackingServices, key_in
 from orchestrator.spec.values import (
     Argument,

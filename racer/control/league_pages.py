@@ -11,7 +11,7 @@ from fastapi import Depends, Query, Request, Response
 
 from orchestrator.api.batch import operations as batch
 from orchestrator.api.http.requests import actor_of, controller_of
-from orchestrator.api.native.job_list import Wanted, page_of_jobs
+from orchestrator.api.native.job_list import JobSelection, page_of_jobs
 from orchestrator.api.native.model_routes import list_models
 from orchestrator.console.forms import Form, Question, body_of, done, sent_form
 from orchestrator.console.live import LiveParts, Recent, Table, stream
@@ -217,7 +217,7 @@ def _races(request: Request, name: str) -> Table:
     """The newest races of a league that the caller may see, by job, without those that are entered."""
     controller, actor = controller_of(request), actor_of(request)
     begins = f"race-{name}-".replace(".", "-")[:60]
-    jobs = page_of_jobs(controller, actor, Wanted(search=begins), _READ)["jobs"]
+    jobs = page_of_jobs(controller, actor, JobSelection(search=begins), _READ)["jobs"]
     if not jobs:
         return Table()
     described = batch.call(controller, actor, "DescribeJobs", {"jobs": [job["id"] for job in jobs]})["jobs"]

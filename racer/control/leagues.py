@@ -17,7 +17,7 @@ from orchestrator.api.http.callers import user_name
 from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.control.controller import Controller
-from orchestrator.domain.errors import ClientError, SpecError
+from orchestrator.domain.errors import ClientError
 from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import named
 from orchestrator.persistence.queries import find_job, unknown_job
@@ -313,10 +313,7 @@ def _submit(
     _checked(controller, league, model)
     facts = model.facts()
     queue = str(facts.get("queue") or (facts.get("spec") or {}).get("queue") or "default")
-    try:
-        spec = race_job(league, model.reference, facts, queue)
-    except SpecError as error:
-        raise ClientError(str(error)) from None
+    spec = race_job(league, model.reference, facts, queue)
     job, _ = submit_spec(
         controller,
         actor,

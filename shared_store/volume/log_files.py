@@ -13,6 +13,7 @@ import errno
 import os
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,8 @@ from shared_store.volume.files import DamagedFile, open_regular, refuse_links
 
 _TAIL = re.compile(r"(node-[0-9]{1,9}\.log)\.([0-9]{15})\.([0-9]{1,15})")
 _HEAD = re.compile(r"node-[0-9]{1,9}\.log")
+CHUNK = 1 << 20
+"""Bytes that are read of a log at once: more than the longest line."""
 _LEVELS = 4
 """Directories from that of a log up to its run: ``<run>/logs/<job>/<attempt>``."""
 _SEGMENTS = 16
@@ -143,6 +146,53 @@ def read_log(
     known = first[: offset + data.rfind(b"\n") + 1]  # half a line may be taken back
     more = not last or position + len(data) < end
     return Chunk(position, data, more, None, Identity(start, known), replaced)
+
+
+@dataclass
+class LogCursor:
+    """A reader's place in one log, which it reads as whole lines."""
+
+    position: int = 0
+    """Position up to which it was read."""
+    identity: Identity = UNKNOWN
+    """Of the file that was read last."""
+    inside: bool = False
+    """Whether ``position`` is inside a line that is longer than any line of Muster's."""
+
+    def read(self, segments: Sequence[LogSegment], most: int = CHUNK, ahead: bool = False) -> Chunk:
+        """The next whole lines, up to ``most`` bytes of them, or up to CHUNK where no line ends in these; as :func:`read_log`."""
+        chunk = read_log(segments, self.position, most, self.identity, self.inside, ahead)
+        if len(chunk.data) == most < CHUNK and b"\n" not in chunk.data:
+            chunk = read_log(segments, self.position, most := CHUNK, self.identity, self.inside, ahead)
+        return self.take(chunk, most)
+
+    def take(self, chunk: Chunk, most: int) -> Chunk:
+        """Move behind the whole lines of a chunk, which was read with ``most``; returns these alone."""
+        whole = chunk.data.rfind(b"\n") + 1
+        self.inside = not whole and len(chunk.data) == most
+        data = chunk.data if self.inside else chunk.data[:whole]
+        self.position, self.identity = chunk.start + len(data), chunk.identity
+        return chunk._replace(data=data, more=chunk.more and bool(data))
+
+
+def log_end(segments: Sequence[LogSegment]) -> int:
+    """The position after the last whole line of a log. Raises OSError."""
+    start, _, path = segments[-1]
+    size = start + path.stat().st_size
+    for most in (4 << 10, CHUNK):
+        begin, data = piece_before(segments, size, most)
+        if at := data.rfind(b"\n") + 1:
+            return begin + at
+    return start
+
+
+def piece_before(segments: Sequence[LogSegment], place: int, most: int) -> tuple[int, bytes]:
+    """Up to ``most`` bytes of one file that end at ``place``, and the position of the first one. Raises OSError."""
+    start, _, path = next((each for each in reversed(segments) if each.start < place), segments[0])
+    begin = max(start, place - most)
+    with open_regular(path) as file:
+        file.seek(max(0, begin - start))
+        return begin, file.read(max(0, place - begin))
 
 
 def left_out(lines: int | None, size: int, why: str) -> str:

@@ -16,22 +16,23 @@ from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Protocol
 
-from shared_store.volume.files import DamagedFile, open_regular, refuse_links
+from shared_store.volume.files import DamagedFile, refuse_links
 from shared_store.volume.layout import Run
-from shared_store.volume.log_files import UNKNOWN, Chunk, Identity, LogSegment, left_out, log_segments, read_log
+from shared_store.volume.log_files import CHUNK, Chunk, LogCursor, LogSegment, left_out, log_end, log_segments
 from shared_store.volume.logs import LIMIT_REACHED, REPLACED, LogLine, lines_in, timestamp
 
 Places = dict[str, int]
 Key = tuple[int, int]
 """Attempt and node of a log."""
 
-CHUNK = 1 << 20
-"""Bytes that a poll reads of a log: more than the longest line."""
 _HEAD = re.compile(r"node-([0-9]{1,9})\.log")
 """Name of a log's first file."""
 _ATTEMPT = re.compile(r"[0-9]{1,9}")
-WHOLE = 512 << 10
-"""More than the longest line."""
+
+
+def place_of(log: Key) -> str:
+    """The name of a log in a place."""
+    return f"{log[0]}/{log[1]}"
 
 
 class Memory(Protocol):
@@ -50,16 +51,10 @@ class Memory(Protocol):
 class NodeLog:
     """A reader's place in one node's log."""
 
-    attempt: int
-    node: int
-    position: int
-    """Position up to which it was read."""
+    key: Key
+    cursor: LogCursor
     returned: int = 0
     """Position up to which lines were returned."""
-    identity: Identity = UNKNOWN
-    """Of the file that was read last."""
-    inside: bool = False
-    """Whether ``position`` is inside a line that is longer than any line of Muster's."""
     newest: str = ""
     """The greatest time so far. Lines are merged by it, so a clock that is set back does not reorder them."""
     read: list[tuple[str, LogLine]] = field(default_factory=list)
@@ -69,71 +64,60 @@ class NodeLog:
     fed: bool = False
     """Whether the last lines came from memory: a network volume may not show them in the file yet."""
 
-    @property
-    def key(self) -> Key:
-        return self.attempt, self.node
-
     def fill(self, segments: Sequence[LogSegment], most: int, rank: int | None = None) -> None:
         """Read on in the files if every line so far has been returned."""
         if self.read:
             return
         try:
-            chunk = read_log(segments, self.position, most, self.identity, self.inside, self.fed)
-            if len(chunk.data) == most < CHUNK and b"\n" not in chunk.data:
-                most = CHUNK
-                chunk = read_log(segments, self.position, most, self.identity, self.inside, self.fed)
+            chunk = self.cursor.read(segments, most, self.fed)
         except OSError:  # deleted meanwhile, ESTALE, or not yet visible on NFS: the next poll opens it again
             self.more = False
             return
-        self.fed = self.fed and not chunk.data
-        self._take_up(chunk, most, rank)
+        self.fed = self.fed and self.cursor.position == chunk.start
+        self._take_up(chunk, rank)
 
     def feed(self, memory: Memory, most: int, rank: int | None = None) -> bool:
         """Read on in memory if every line so far has been returned; False where only the files have what follows."""
         if self.read:
             return True
-        data = memory.read(self.key, self.position, most)
+        position = self.cursor.position
+        data = memory.read(self.key, position, most)
         if data is not None and len(data) == most and b"\n" not in data:
-            data = memory.read(self.key, self.position, most := CHUNK)
+            data = memory.read(self.key, position, most := CHUNK)
         if data is None:
             self.fed = False
             return False
         self.more = False
         if data:
             self.fed = True
-            self._take_up(Chunk(self.position, data, len(data) == most, None, self.identity), most, rank)
+            chunk = Chunk(position, data, len(data) == most, None, self.cursor.identity)
+            self._take_up(self.cursor.take(chunk, most), rank)
         return True
 
-    def _take_up(self, chunk: Chunk, most: int, rank: int | None) -> None:
-        whole = chunk.data.rfind(b"\n") + 1
-        self.inside = not whole and len(chunk.data) == most
-        if self.inside:
-            whole = len(chunk.data)
+    def _take_up(self, chunk: Chunk, rank: int | None) -> None:
         if chunk.left_out or chunk.replaced:
-            first = next(lines_in(chunk.data, self.key, 0, 0, whole), None)
+            first = next(lines_in(chunk.data, self.key, 0), None)
             self._explain(chunk, first[1].time if first else timestamp(time.time()))
         newest, read = self.newest, self.read
-        for _, line in lines_in(chunk.data, self.key, chunk.start, 0, whole):
+        for _, line in lines_in(chunk.data, self.key, chunk.start):
             if line.time > newest:
                 newest = line.time
             if rank is None or line.rank == rank:
                 read.append((newest, line))
-        self.newest = newest
-        self.more = chunk.more and bool(whole)
-        self.position, self.identity = chunk.start + whole, chunk.identity
+        self.newest, self.more = newest, chunk.more
 
     def _explain(self, chunk: Chunk, stamp: str) -> None:
         """Add a line that says which part is missing."""
         text = REPLACED if chunk.replaced else left_out(*chunk.left_out, LIMIT_REACHED) if chunk.left_out else ""
         self.newest = self.newest or stamp
-        self.read.append((self.newest, LogLine(self.newest, self.attempt, self.node, None, "e", text, chunk.start)))
+        self.read.append((self.newest, LogLine(self.newest, *self.key, None, "e", text, chunk.start)))
 
     def take(self, until: str | None = None) -> list[tuple[str, LogLine]]:
         """The lines up to that time; None: all."""
         count = len(self.read) if until is None else bisect_right(self.read, until, key=itemgetter(0))
         taken, self.read = self.read[:count], self.read[count:]
         if not self.read:
-            self.returned = self.position
+            self.returned = self.cursor.position
         elif taken:
             self.returned = taken[-1][1].position
         return taken
@@ -177,7 +161,7 @@ class Chosen:
 
     def end(self) -> Places:
         """The place after the last whole line. Raises OSError."""
-        return {f"{attempt}/{node}": log_end(segments) for (attempt, node), segments in self.logs().items()}
+        return {place_of(log): log_end(segments) for log, segments in self.logs().items()}
 
 
 @dataclass
@@ -262,13 +246,13 @@ class LogView:
 
     def _log(self, key: Key) -> NodeLog:
         if key not in self._logs:
-            start = self.offsets.get(f"{key[0]}/{key[1]}", 0)
-            self._logs[key] = NodeLog(*key, start, start)
+            start = self.offsets.get(place_of(key), 0)
+            self._logs[key] = NodeLog(key, LogCursor(start), start)
         return self._logs[key]
 
     def _merged(self, logs: Sequence[NodeLog]) -> list[LogLine]:
         taken, self.behind = merged(logs)
-        self.offsets.update({f"{log.attempt}/{log.node}": log.returned for log in logs})
+        self.offsets.update({place_of(log.key): log.returned for log in logs})
         return [line for _, line in taken]
 
 
@@ -289,23 +273,3 @@ def logs_of(run: Run, job: str, attempt: int) -> dict[Key, list[LogSegment]]:
         if match := _HEAD.fullmatch(name):
             found[attempt, int(match[1])] = segments
     return dict(sorted(found.items()))
-
-
-def log_end(segments: Sequence[LogSegment]) -> int:
-    """The position after the last whole line of a log. Raises OSError."""
-    start, _, path = segments[-1]
-    size = start + path.stat().st_size
-    for most in (4 << 10, WHOLE):
-        begin, data = piece_before(segments, size, most)
-        if at := data.rfind(b"\n") + 1:
-            return begin + at
-    return start
-
-
-def piece_before(segments: Sequence[LogSegment], place: int, most: int) -> tuple[int, bytes]:
-    """Up to ``most`` bytes of one file that end at ``place``, and the position of the first one."""
-    start, _, path = next((each for each in reversed(segments) if each.start < place), segments[0])
-    begin = max(start, place - most)
-    with open_regular(path) as file:
-        file.seek(max(0, begin - start))
-        return begin, file.read(max(0, place - begin))

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import heapq
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import accumulate, islice, pairwise
 from operator import itemgetter
 
-from shared_store.volume.log_files import LogSegment, left_out, read_log
-from shared_store.volume.log_view import CHUNK, WHOLE, Chosen, Key, LogView, Places, log_end, piece_before
+from shared_store.volume.log_files import CHUNK, LogCursor, LogSegment, left_out, log_end, piece_before
+from shared_store.volume.log_view import Chosen, Key, LogView, Places, place_of
 from shared_store.volume.logs import LIMIT_REACHED, LogLine, lines_in
 
 LINES_A_WINDOW = 400
@@ -49,40 +52,54 @@ class Window:
     """Whether there are earlier lines (of :func:`lines_before`) or later ones (of :func:`lines_after`)."""
 
 
+class _Unread(Exception):
+    """A log has more lines, which are not read for this window."""
+
+
 @dataclass
 class _Back:
     """One log that is read backwards."""
 
-    attempt: int
-    node: int
+    log: Key
     segments: Sequence[LogSegment]
     place: int
-    lines: list[tuple[int, LogLine]] = field(default_factory=list)
-    """Those that are chosen, with the positions before them."""
-    oldest: str = ""
-    """Time of the first line that was read, chosen or not."""
+    """Position from which on all chosen lines were returned."""
 
-    def read(self, rank: int | None) -> None:
-        """Read the piece before ``place``."""
-        start, data = piece_before(self.segments, self.place, _PIECE)
-        if b"\n" not in data[:-1] and self.place - start >= _PIECE:
-            start, data = piece_before(self.segments, self.place, WHOLE)
-        cut = 0 if any(start == each.start for each in self.segments) else data.find(b"\n") + 1
-        if cut == len(data):
-            cut = 0  # a line that is none of Muster's: it is left out
-        every = list(lines_in(data, (self.attempt, self.node), start, cut))
-        self.oldest = every[0][1].time if every else self.oldest
-        found = [each for each in every if rank is None or each[1].rank == rank]
-        missing = self._gap(start + cut)
-        if missing:
-            text = left_out(None, missing, LIMIT_REACHED)
-            found.insert(0, (start + cut, LogLine(self.oldest, self.attempt, self.node, None, "e", text, start + cut)))
-        self.lines = found + self.lines
-        self.place = start + cut - missing
+    def lines(self, rank: int | None) -> Iterator[tuple[str, int, LogLine, _Back]]:
+        """The chosen lines before ``place``, the last one first: its time for merging, the position before it, the line, this log.
+
+        Raises _Unread behind the last line that is read, OSError.
+        """
+        place, oldest, later = self.place, "", "~"
+        for _ in range(_ROUNDS):
+            if not place:
+                break
+            start, data = piece_before(self.segments, place, _PIECE)
+            if b"\n" not in data[:-1] and place - start >= _PIECE:
+                start, data = piece_before(self.segments, place, CHUNK)
+            cut = 0 if any(start == each.start for each in self.segments) else data.find(b"\n") + 1
+            if cut == len(data):
+                cut = 0  # a line that is none of Muster's: it is left out
+            every = list(lines_in(data, self.log, start, cut))
+            # a clock that was set back does not reorder the lines of a node
+            times = accumulate((line.time for _, line in every), max)
+            for time, (begin, line) in reversed(list(zip(times, every, strict=True))):
+                later = min(later, time)
+                if rank in (None, line.rank):
+                    yield later, begin, line, self
+            oldest = every[0][1].time if every else oldest
+            begin = start + cut
+            place = begin - self._gap(begin)
+            if place < begin:
+                text = left_out(None, begin - place, LIMIT_REACHED)
+                yield min(later, oldest), place, LogLine(oldest, *self.log, None, "e", text, begin), self
+        self.place = place
+        if place:
+            raise _Unread
 
     def _gap(self, place: int) -> int:
         """Bytes before ``place`` that were deleted when the log reached its limit."""
-        for before, after in zip(self.segments, self.segments[1:], strict=False):
+        for before, after in pairwise(self.segments):
             if after.start == place:
                 return max(0, place - before.start - before.path.stat().st_size)
         return 0
@@ -97,50 +114,21 @@ def lines_before(chosen: Chosen, place: Mapping[str, int], most: int = LINES_A_W
     first = dict(place)
     logs = chosen.logs()
     for attempt in sorted({each for each, _ in logs}, reverse=True):
-        sources = [
-            _Back(attempt, node, segments, place.get(f"{attempt}/{node}", 0))
-            for (of, node), segments in logs.items()
-            if of == attempt and place.get(f"{attempt}/{node}", 0) > 0
-        ]
-        lines = _merged_before(sources, chosen.rank, most - len(found), first)
-        found = lines + found
-        if any(first.get(f"{attempt}/{source.node}", 0) for source in sources) or len(found) >= most:
+        sources = [_Back(log, logs[log], place.get(place_of(log), 0)) for log in logs if log[0] == attempt]
+        # of lines of the same time, those of the last node are the last
+        lines = heapq.merge(*(each.lines(chosen.rank) for each in reversed(sources)), key=itemgetter(0), reverse=True)
+        with suppress(_Unread):  # what is older may be older than a line that was not read
+            for _, begin, line, source in islice(lines, most - len(found)):
+                found.append(line)
+                source.place = begin
+        first |= {
+            place_of(source.log): source.place
+            for source in sources
+            if source.place != place.get(place_of(source.log), 0)
+        }
+        if len(found) >= most or any(source.place for source in sources):
             break
-    return Window(found, first, dict(place), any(first.get(f"{attempt}/{node}", 0) for attempt, node in logs))
-
-
-def _merged_before(sources: Sequence[_Back], rank: int | None, most: int, first: Places) -> list[LogLine]:
-    """The last ``most`` lines of several logs by their times; notes in ``first`` where they begin."""
-    bound = ""
-    for _ in range(_ROUNDS):
-        # what is older than the first line read of a log that goes on may be older than a line of it that was not read yet
-        bound = max((source.oldest for source in sources if source.place), default="")
-        ready = sum(line.time >= bound for source in sources for _, line in source.lines)
-        reading = [source for source in sources if source.place and source.oldest >= bound]
-        if ready >= most or not reading:
-            break
-        for source in reading:
-            source.read(rank)
-    bound = max((source.oldest for source in sources if source.place), default="")
-    kept: list[tuple[str, int, int, LogLine]] = []
-    for number, source in enumerate(sources):
-        newest = ""
-        for index, (_, line) in enumerate(source.lines):
-            newest = max(newest, line.time)  # a clock that was set back does not reorder the lines of a node
-            if newest >= bound:
-                kept.append((newest, number, index, line))
-    kept = sorted(kept, key=itemgetter(0, 1, 2))[-most:] if most > 0 else []
-    begins: dict[int, int] = {}
-    for _, number, index, _ in kept:
-        begins[number] = min(index, begins.get(number, index))
-    for number, source in enumerate(sources):
-        begin = begins.get(number, len(source.lines))
-        if begin == 0:  # all that was read is returned, also what is of other ranks
-            place = source.place
-        else:
-            place = source.lines[begin][0] if begin < len(source.lines) else source.lines[-1][1].position
-        first[f"{source.attempt}/{source.node}"] = place
-    return [line for *_, line in kept]
+    return Window(found[::-1], first, dict(place), any(first.get(place_of(log), 0) for log in logs))
 
 
 def lines_after(chosen: Chosen, place: Mapping[str, int], most: int = LINES_A_WINDOW) -> Window:
@@ -156,7 +144,7 @@ def lines_after(chosen: Chosen, place: Mapping[str, int], most: int = LINES_A_WI
         lines += follower.poll()
     if len(lines) <= most:
         return Window(lines, dict(place), dict(follower.offsets), follower.behind)
-    taken = {f"{line.attempt}/{line.node}": line.position for line in lines[:most]}
+    taken = {place_of((line.attempt, line.node)): line.position for line in lines[:most]}
     return Window(lines[:most], dict(place), {**place, **taken}, True)
 
 
@@ -191,30 +179,19 @@ def _search(
     """``each``: whether ``most`` lines of each log are wanted, and not of all together."""
     found: list[LogLine] = []
     reached, left = dict(place), _SEARCHED
-    for (attempt, node), segments in chosen.logs().items():
-        key, inside, here = f"{attempt}/{node}", False, 0
-        while True:
-            chunk = read_log(segments, reached.get(key, 0), CHUNK, inside=inside)
-            if not chunk.data:
-                break
-            whole = chunk.data.rfind(b"\n") + 1
-            inside = not whole
-            if not whole and len(chunk.data) < CHUNK:
-                break  # half a line, which is being written
-            data = chunk.data[: whole or len(chunk.data)]
-            left_over = most - here if each else most - len(found)
-            hits = _hits(data, (attempt, node), chunk.start, needles, accepts, chosen.rank, left_over)
+    for log, segments in chosen.logs().items():
+        key, before = place_of(log), len(found) if each else 0
+        cursor = LogCursor(reached.get(key, 0))
+        while (chunk := cursor.read(segments)).data:
+            hits = _hits(chunk.data, log, chunk.start, needles, accepts, chosen.rank, most + before - len(found))
             found += hits
-            here += len(hits)
-            is_enough = (here if each else len(found)) >= most
-            reached[key] = hits[-1].position if is_enough else chunk.start + len(data)
-            left -= len(data)
-            if is_enough and not each:
-                return FoundLines(found, reached, False)
-            if is_enough:
+            left -= len(chunk.data)
+            is_enough = len(found) - before >= most
+            reached[key] = hits[-1].position if is_enough else cursor.position
+            if is_enough and each:
                 reached[key] = log_end(segments)
                 break
-            if left <= 0:
+            if is_enough or left <= 0:
                 return FoundLines(found, reached, False)
     return FoundLines(found, reached, True)
 
@@ -233,10 +210,10 @@ def _hits(
     nexts = {needle: folded.find(needle) for needle in needles}
     hits: list[LogLine] = []
     while len(hits) < most:
-        there = min((at for at in nexts.values() if at >= 0), default=-1)
-        if there < 0:
+        at = min((at for at in nexts.values() if at >= 0), default=-1)
+        if at < 0:
             break
-        begin, end = data.rfind(b"\n", 0, there) + 1, data.find(b"\n", there) + 1
+        begin, end = data.rfind(b"\n", 0, at) + 1, data.find(b"\n", at) + 1
         if end == 0:
             break
         for _, line in lines_in(data, log, start, begin, end):

@@ -42,6 +42,46 @@ def fixed_settings(kind: Any, saved: Any = None, *, of_clone: bool = False) -> l
     return fixed if saved is None else [key for key in fixed if key.partition(".")[0] in saved]
 
 
+def changed_task(kind: Any, old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str, Any, Any] | None:
+    """The first of task, algorithm, seed and task's configuration that differs, which a run keeps: its innermost key, and both values.
+
+    Args:
+        kind: Class of the task's configuration, which names the fields that may change; None if unknown.
+        old: Section ``train`` of the run.
+        new: That of the job that would continue it.
+    """
+    may_change = getattr(kind, "may_change", ())
+    kept = [
+        {**train, "config": {key: value for key, value in (train.get("config") or {}).items() if key not in may_change}}
+        for train in (old, new)
+    ]
+    difference = first_difference(kept[0], kept[1], ("task", "algorithm", "seed", "config"))
+    return None if difference is None else innermost(*difference)
+
+
+def changed_setting(
+    kind: Any, old: Any, new: Any, saved: Any = None, *, of_clone: bool = False
+) -> tuple[str, Any, Any, bool] | None:
+    """The first setting of an algorithm that differs although a run has to keep it.
+
+    Args:
+        kind: Class of the settings.
+        old: The run's.
+        new: Those of the job that would continue it, or of the clone.
+        saved: As of :func:`fixed_settings`.
+        of_clone: Whether that job begins a clone.
+
+    Returns:
+        The innermost key, both values, and whether a clone may change the setting.
+    """
+    difference = first_difference(old, new, fixed_settings(kind, saved, of_clone=of_clone))
+    return (
+        None
+        if difference is None
+        else (*innermost(*difference), difference[0] in getattr(kind, "clone_may_change", ()))
+    )
+
+
 def merged(settings: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
     """``settings`` with the changes: sections are merged key by key; other values, the contents of files, and sections that become empty,
     are replaced."""

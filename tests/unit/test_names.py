@@ -16,7 +16,7 @@ NAMELESS = {"__init__", "__main__"}
 
 MODULES = {
     "a use case and its adapters: routes, commands, pages": """
-        compute_environments curves definitions evaluations export fit jobs keys leagues lineage logs models operations plugins queues
+        compute_environments curves evaluations export fit jobs keys leagues logs models operations plugins queues
         references retention robot runs submission texts webhooks""",
     "the settings of a thing, and the thing": "actions camera cartpole lift quadruped running sac task velocity",
     "a robot, and the task for it": "g1 go1",

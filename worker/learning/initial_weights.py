@@ -15,7 +15,7 @@ from shared_store.contract.policy_changes import brief, differences, robot_chang
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.initial_weights import parent_checkpoint
-from shared_store.volume.run_settings import first_difference, fixed_settings, innermost
+from shared_store.volume.run_settings import changed_setting
 from worker.learning.algorithm import Algorithm, Student
 from worker.learning.algorithms import section_of
 from worker.learning.distributed import Gang
@@ -113,9 +113,9 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
                 f"train.algorithm: {learnt}, or a module:Class of your own whose load_state_dict reads them"
             )
         return  # whether a class of the user's own reads the other's, or is read, only the loading shows
-    fixed = fixed_settings(algorithm.config_type, there.get("settings") or {}, of_clone=True)
-    if difference := first_difference(there.get("settings"), here["settings"], fixed):
-        key, old, new = innermost(*difference)
+    saved = there.get("settings") or {}
+    if changed := changed_setting(algorithm.config_type, saved, here["settings"], saved, of_clone=True):
+        key, old, new, _ = changed
         raise UserError(
             f"the weights of checkpoint {checkpoint.name} do not fit this job: {section_of(here['algorithm'])}.{key} is {old!r} "
             f"there and {new!r} here; leave the setting as it is there"

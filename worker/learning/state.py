@@ -25,7 +25,7 @@ from shared_store.volume.checkpoints import (
     sweep,
 )
 from shared_store.volume.epoch import check_epoch
-from shared_store.volume.run_settings import first_difference, fixed_settings, innermost, setting_at
+from shared_store.volume.run_settings import changed_setting, changed_task, setting_at
 from worker.learning.algorithm import Algorithm, WorldShare
 from worker.learning.algorithms import section_of
 from worker.learning.distributed import Gang
@@ -279,14 +279,14 @@ class TrainingState:
             raise UserError(
                 f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms; start a new run"
             )
-        for facts in (there, here):
-            for key in getattr(self.task.config, "may_change", ()):
-                (facts["train"].get("config") or {}).pop(key, None)
-        settings = [f"settings.{key}" for key in fixed_settings(self.algorithm.config_type, there["settings"])]
-        if difference := first_difference(there, here, ["task", "algorithm", "train.seed", "train.config", *settings]):
-            key, old, new = innermost(*difference)
-            if difference[0] in settings:  # its name in a job's YAML
-                key = f"{section_of(there['algorithm'])}.{key.removeprefix('settings.')}"
+        trains = [{**facts["train"], "task": facts["task"], "algorithm": facts["algorithm"]} for facts in (there, here)]
+        changed = changed_setting(self.algorithm.config_type, there["settings"], here["settings"], there["settings"])
+        if difference := changed_task(self.task.config, *trains) or changed:
+            key, old, new, *of_algorithm = difference
+            if of_algorithm:
+                key = f"{section_of(there['algorithm'])}.{key}"
+            elif key not in ("task", "algorithm"):
+                key = f"train.{key}"
             raise UserError(
                 f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {key} is {old!r} there and {new!r} "
                 "here; start a new run for that (`muster clone` begins one with its weights)"

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import re
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from itertools import combinations
 from typing import Any
 
 from sqlalchemy import select
 
 from orchestrator.api.batch import fargate, validation
-from orchestrator.api.batch.engine_tags import check_engine_tags
-from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.batch.paging import page
+from orchestrator.api.batch.tags import check_engine_tags
+from orchestrator.api.batch.value_checks import check_choice, check_name, check_range, check_tags
 from orchestrator.control.compute_environments import is_built_in
 from orchestrator.domain.errors import ClientError
 from orchestrator.engines.registry import FRESH
@@ -28,14 +30,13 @@ def create_compute_environment(context: Context, request: dict[str, Any]) -> dic
     """CreateComputeEnvironment. Subnets, instance types and the like are kept and shown, and mean nothing to the engine."""
     context.actor.check(Operation.CREATE_COMPUTE_ENVIRONMENT, Shared())
     name = request["computeEnvironmentName"]
-    validation.check_name("computeEnvironmentName", name)
-    validation.check_tags(request.get("tags") or {})
+    check_name("computeEnvironmentName", name)
+    check_tags(request.get("tags") or {})
     if context.session.get(ComputeEnvironment, name):
         raise ClientError(f"Compute environment {name} exists already; UpdateComputeEnvironment changes it")
     if len(context.session.scalars(select(ComputeEnvironment.name)).all()) >= _MOST_COMPUTE_ENVIRONMENTS:
         raise ClientError(f"there are {_MOST_COMPUTE_ENVIRONMENTS} compute environments; delete one first")
-    if request["type"] not in ("MANAGED", "UNMANAGED"):
-        raise ClientError(f"type is {request['type'][:50]!r}; it is MANAGED or UNMANAGED")
+    check_choice("type", request["type"], "MANAGED", "UNMANAGED")
     _check_members(request)
     resources = request.get("computeResources")
     if request["type"] == "MANAGED" and not resources:
@@ -43,7 +44,8 @@ def create_compute_environment(context: Context, request: dict[str, Any]) -> dic
     _check_resources(resources or {})
     document = {key: value for key, value in request.items() if key not in ("tags", "state")}
     compute_environment = ComputeEnvironment(name=name, document=document, tags=request.get("tags") or {})
-    compute_environment.state = _state(request.get("state", "ENABLED"))
+    compute_environment.state = request.get("state", "ENABLED")
+    check_choice("state", compute_environment.state, "ENABLED", "DISABLED")
     check_engine_tags(context, compute_environment, compute_environment.tags)
     context.session.add(compute_environment)
     return {"computeEnvironmentName": name, "computeEnvironmentArn": compute_environment_arn(name)}
@@ -54,17 +56,18 @@ def describe_compute_environments(context: Context, request: dict[str, Any]) -> 
     query = select(ComputeEnvironment).order_by(ComputeEnvironment.name)
     if named := request.get("computeEnvironments"):
         query = query.where(ComputeEnvironment.name.in_([plain_name(each, "compute-environment") for each in named]))
-    rows, token = page(context.session, query, request, page_size(request, 100), (ComputeEnvironment.name,), (False,))
+    rows, token = page(context.session, query, request, ComputeEnvironment.name)
     return {"computeEnvironments": [_describe(context, compute_environment) for compute_environment in rows], **token}
 
 
 def update_compute_environment(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateComputeEnvironment: state and resources; running jobs are left alone."""
-    compute_environment = _compute_environment(context, request["computeEnvironment"])
+    compute_environment = context.named(ComputeEnvironment, request["computeEnvironment"])
     context.actor.check(Operation.UPDATE_COMPUTE_ENVIRONMENT, compute_environment)
     _check_members(request)
     if (state := request.get("state")) is not None:
-        compute_environment.state = _state(state)
+        check_choice("state", state, "ENABLED", "DISABLED")
+        compute_environment.state = state
     if changes := request.get("computeResources"):
         if compute_environment.document["type"] != "MANAGED":
             raise ClientError(
@@ -111,8 +114,8 @@ def create_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
     """CreateSchedulingPolicy with a fairsharePolicy."""
     context.actor.check(Operation.CREATE_SCHEDULING_POLICY, Shared())
     name = request["name"]
-    validation.check_name("name", name)
-    validation.check_tags(request.get("tags") or {})
+    check_name("name", name)
+    check_tags(request.get("tags") or {})
     if request.get("quotaSharePolicy"):
         raise ClientError("quotaSharePolicy is for service jobs, which are not supported; use fairsharePolicy")
     if context.session.get(SchedulingPolicy, name):
@@ -140,13 +143,13 @@ def describe_scheduling_policies(context: Context, request: dict[str, Any]) -> d
 def list_scheduling_policies(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """ListSchedulingPolicies."""
     query = select(SchedulingPolicy).order_by(SchedulingPolicy.name)
-    rows, token = page(context.session, query, request, page_size(request, 100), (SchedulingPolicy.name,), (False,))
+    rows, token = page(context.session, query, request, SchedulingPolicy.name)
     return {"schedulingPolicies": [{"arn": policy_arn(policy.name)} for policy in rows], **token}
 
 
 def update_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """UpdateSchedulingPolicy: the fairsharePolicy is replaced."""
-    policy = _policy(context, request["arn"])
+    policy = context.named(SchedulingPolicy, request["arn"])
     context.actor.check(Operation.UPDATE_SCHEDULING_POLICY, policy)
     if request.get("quotaSharePolicy"):
         raise ClientError(f"Scheduling policy {policy.name} has a fairsharePolicy; its kind can't change")
@@ -158,7 +161,7 @@ def update_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
 
 def delete_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DeleteSchedulingPolicy of one that no queue uses."""
-    policy = _policy(context, request["arn"])
+    policy = context.named(SchedulingPolicy, request["arn"])
     context.actor.check(Operation.DELETE_SCHEDULING_POLICY, policy)
     user = context.session.scalars(select(JobQueue).where(JobQueue.policy == policy.name).limit(1)).first()
     if user is not None:
@@ -167,30 +170,10 @@ def delete_scheduling_policy(context: Context, request: dict[str, Any]) -> dict[
     return {}
 
 
-def _compute_environment(context: Context, reference: str) -> ComputeEnvironment:
-    compute_environment = context.session.get(ComputeEnvironment, plain_name(reference, "compute-environment"))
-    if compute_environment is None:
-        raise ClientError(f"Compute environment {reference[:300]} does not exist")
-    return compute_environment
-
-
 def _queue_of(context: Context, compute_environment: ComputeEnvironment) -> str | None:
     """The name of a queue with this compute environment; None where there is none."""
     queues = context.session.scalars(select(JobQueue))
     return next((each.name for each in queues if compute_environment.name in each.compute_environments), None)
-
-
-def _policy(context: Context, arn: str) -> SchedulingPolicy:
-    policy = context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy"))
-    if policy is None:
-        raise ClientError(f"Scheduling policy {arn[:300]} does not exist")
-    return policy
-
-
-def _state(state: str) -> str:
-    if state not in ("ENABLED", "DISABLED"):
-        raise ClientError(f"state is {state[:50]!r}; it is ENABLED or DISABLED")
-    return state
 
 
 def _check_members(request: Mapping[str, Any]) -> None:
@@ -211,27 +194,19 @@ def _check_members(request: Mapping[str, Any]) -> None:
     if of_eks:
         raise ClientError(f"{of_eks[0]} {validation.NO_KUBERNETES} leave it out")
     insights = (request.get("ecsSettings") or {}).get("containerInsights") or "DISABLED"
-    if insights not in ("ENABLED", "ENHANCED", "DISABLED"):
-        raise ClientError(f"containerInsights is {insights[:50]!r}; it is ENABLED, ENHANCED or DISABLED")
+    check_choice("containerInsights", insights, "ENABLED", "ENHANCED", "DISABLED")
 
 
 def _check_resources(resources: Mapping[str, Any]) -> None:
     fargate.check_resources(resources)
     for key in ("minvCpus", "maxvCpus", "desiredvCpus"):
-        if resources.get(key) is not None and not 0 <= resources[key] <= 10_000_000:
-            raise ClientError(f"computeResources {key} is {resources[key]}; it must be 0 to 10000000")
+        check_range(f"computeResources {key}", resources.get(key), 0, 10_000_000)
 
 
 def _check_fairshare(fairshare: Mapping[str, Any]) -> None:
-    decay, reservation = fairshare.get("shareDecaySeconds", 0), fairshare.get("computeReservation", 0)
-    if not 0 <= decay <= 604_800:
-        raise ClientError(f"shareDecaySeconds is {decay}; it must be 0 to 604800")
-    if not 0 <= reservation <= 99:
-        raise ClientError(f"computeReservation is {reservation}; it must be 0 to 99")
-    _check_shares(fairshare.get("shareDistribution") or [])
-
-
-def _check_shares(shares: Sequence[Mapping[str, Any]]) -> None:
+    check_range("shareDecaySeconds", fairshare.get("shareDecaySeconds"), 0, 604_800)
+    check_range("computeReservation", fairshare.get("computeReservation"), 0, 99)
+    shares = fairshare.get("shareDistribution") or []
     if len(shares) > 500:
         raise ClientError(f"shareDistribution has {len(shares)} entries; at most 500")
     names = [each["shareIdentifier"] for each in shares]
@@ -240,12 +215,10 @@ def _check_shares(shares: Sequence[Mapping[str, Any]]) -> None:
             raise ClientError(
                 f"shareIdentifier {each['shareIdentifier'][:100]!r}: 1 to 255 letters and digits, a * at the end at most"
             )
-        if not 0.0001 <= each.get("weightFactor", 1.0) <= 999.9999:
-            raise ClientError(f"weightFactor is {each['weightFactor']}; it must be 0.0001 to 999.9999")
-    for i, name in enumerate(names):
-        for other in names[:i]:
-            if _matches(name, other) or _matches(other, name):
-                raise ClientError(f"shareDistribution: {other} and {name} overlap")
+        check_range("weightFactor", each.get("weightFactor"), 0.0001, 999.9999)
+    for other, name in combinations(names, 2):
+        if _matches(name, other) or _matches(other, name):
+            raise ClientError(f"shareDistribution: {other} and {name} overlap")
 
 
 def _matches(pattern: str, name: str) -> bool:

@@ -8,14 +8,15 @@ from sqlalchemy import select
 
 from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.descriptions import ecs_with_defaults, node_ranges, retry_strategy, with_defaults
-from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.batch.paging import page
+from orchestrator.api.batch.value_checks import check_name, check_range, check_tags
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import JobDefinition
 from orchestrator.services import permissions
 from orchestrator.services.arns import definition_arn, plain_name
 from orchestrator.services.context import Context
-from orchestrator.services.definitions import revision
 from orchestrator.services.permissions import Actor, Operation
+from orchestrator.services.submission import revision
 
 _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 
@@ -23,18 +24,18 @@ _PROPERTIES = ("nodeProperties", "containerProperties", "ecsProperties")
 def register_job_definition(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """RegisterJobDefinition; each registration of a name is a new revision."""
     name, kind = request["jobDefinitionName"], request["type"]
-    validation.check_name("jobDefinitionName", name)
+    check_name("jobDefinitionName", name)
     validation.check_tries(request)
-    validation.check_tags(request.get("tags") or {})
-    validation.check_priority("schedulingPriority", request.get("schedulingPriority"))
-    wanted = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
-    if wanted is None:
+    check_tags(request.get("tags") or {})
+    check_range("schedulingPriority", request.get("schedulingPriority"), 0, 9999)
+    allowed = {"multinode": ["nodeProperties"], "container": ["containerProperties", "ecsProperties"]}.get(kind)
+    if allowed is None:
         raise ClientError(f"job definition {name}: type {kind[:50]!r} is not supported; it is multinode or container")
     if request.get("eksProperties"):
-        raise ClientError(f"job definition {name}: eksProperties {validation.NO_KUBERNETES} use {' or '.join(wanted)}")
-    given = [key for key in _PROPERTIES if request.get(key)]
-    if len(given) != 1 or given[0] not in wanted:
-        raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(wanted)}, and only that")
+        raise ClientError(f"job definition {name}: eksProperties {validation.NO_KUBERNETES} use {' or '.join(allowed)}")
+    present = [key for key in _PROPERTIES if request.get(key)]
+    if len(present) != 1 or present[0] not in allowed:
+        raise ClientError(f"job definition {name}: type {kind} needs {' or '.join(allowed)}, and only that")
     properties = validation.node_properties(request)
     gang = validation.check_nodes(properties, kind)
     fargate.check_platform(request, properties, f"job definition {name}")
@@ -50,11 +51,11 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
     listed = request.get("jobDefinitions") or []
     query = select(JobDefinition).order_by(JobDefinition.name, JobDefinition.revision.desc())
     if listed:
-        wanted = [plain_name(each, "job-definition").partition(":") for each in listed]
+        allowed = [plain_name(each, "job-definition").partition(":") for each in listed]
         found = [
             each
-            for each in context.session.scalars(query.where(JobDefinition.name.in_([name for name, _, _ in wanted])))
-            if any(each.name == name and revision in ("", str(each.revision)) for name, _, revision in wanted)
+            for each in context.session.scalars(query.where(JobDefinition.name.in_([name for name, _, _ in allowed])))
+            if any(each.name == name and revision in ("", str(each.revision)) for name, _, revision in allowed)
             and request.get("status") in (None, each.status)
         ]
         return {"jobDefinitions": [_describe(context.actor, each) for each in found]}
@@ -62,9 +63,8 @@ def describe_job_definitions(context: Context, request: dict[str, Any]) -> dict[
         query = query.where(JobDefinition.name == plain_name(name, "job-definition").partition(":")[0])
     if status := request.get("status"):
         query = query.where(JobDefinition.status == status)
-    found_page, token = page(
-        context.session, query, request, page_size(request, 100), (JobDefinition.name, JobDefinition.revision)
-    )
+    keys = JobDefinition.name, JobDefinition.revision
+    found_page, token = page(context.session, query, request, *keys, descending=(False, True))
     return {"jobDefinitions": [_describe(context.actor, each) for each in found_page], **token}
 
 

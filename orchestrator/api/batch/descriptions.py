@@ -91,10 +91,10 @@ def _in_ecs(container: Mapping[str, Any], name: str) -> dict[str, Any]:
     return to_ecs(container, name, task)
 
 
-def retry_strategy(given: Mapping[str, Any]) -> dict[str, Any]:
+def retry_strategy(strategy: Mapping[str, Any]) -> dict[str, Any]:
     """``retryStrategy`` as AWS shows it; ``action`` is taken in any case, and shown in that of the model."""
-    conditions = given.get("evaluateOnExit") or []
-    return {**given, "evaluateOnExit": [{**each, "action": each["action"].upper()} for each in conditions]}
+    conditions = strategy.get("evaluateOnExit") or []
+    return {**strategy, "evaluateOnExit": [{**each, "action": each["action"].upper()} for each in conditions]}
 
 
 def with_defaults(container: Mapping[str, Any], definition: Mapping[str, Any]) -> dict[str, Any]:
@@ -168,8 +168,10 @@ def summarize(job: Job, reason: str | None = None, node: int | None = None) -> d
 def describe_damaged(job: Job, reason: str | None) -> dict[str, Any]:
     """JobSummary of a job whose row is damaged: the readable facts, and a reason that tells of the damage."""
     summary = _common(job, reason)
-    said = summary["statusReason"] or ""
-    summary["statusReason"] = said if DAMAGED in said else f"{said}; {DAMAGED}" if said else DAMAGED
+    reason_text = summary["statusReason"] or ""
+    summary["statusReason"] = (
+        reason_text if DAMAGED in reason_text else f"{reason_text}; {DAMAGED}" if reason_text else DAMAGED
+    )
     return {key: value for key, value in summary.items() if value is not None}
 
 

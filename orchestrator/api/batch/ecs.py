@@ -20,9 +20,9 @@ def from_ecs(properties: Mapping[str, Any], where: str) -> dict[str, Any]:
     """The equivalent ``containerProperties``. Raises ClientError for members without an equivalent."""
     task = _only(properties["taskProperties"], "task", where)
     container = _only(task["containers"], "container", where)
-    for given, keys in ((task, _UNSUPPORTED_OF_TASK), (container, _UNSUPPORTED_OF_CONTAINER)):
+    for section, keys in ((task, _UNSUPPORTED_OF_TASK), (container, _UNSUPPORTED_OF_CONTAINER)):
         for key in keys:
-            if given.get(key):
+            if section.get(key):
                 raise ClientError(f"{where}: {key} is not supported; leave it out")
     if container.get("essential") is False:
         raise ClientError(f"{where}: the only container of a job is essential; leave essential out")
@@ -30,16 +30,16 @@ def from_ecs(properties: Mapping[str, Any], where: str) -> dict[str, Any]:
     return {**same, **{ours: task[theirs] for theirs, ours in _OF_TASK.items() if theirs in task}}
 
 
-def override_from_ecs(override: Mapping[str, Any], there: str, where: str) -> dict[str, Any]:
-    """The ``containerOverrides`` that mean the same as ``ecsPropertiesOverride`` of a container called ``there``. Raises ClientError."""
+def override_from_ecs(override: Mapping[str, Any], defined: str, where: str) -> dict[str, Any]:
+    """The ``containerOverrides`` that mean the same as ``ecsPropertiesOverride`` of a container called ``defined``. Raises ClientError."""
     if not override.get("taskProperties"):
         return {}
     containers = _only(override["taskProperties"], "task", where).get("containers")
     if not containers:
         return {}
     changes = dict(_only(containers, "container", where))
-    if (name := changes.pop("name", None)) is not None and name != there:
-        raise ClientError(f"{where}: there is no container {name[:100]!r}; the definition's is called {there!r}")
+    if (name := changes.pop("name", None)) is not None and name != defined:
+        raise ClientError(f"{where}: there is no container {name[:100]!r}; the definition's is called {defined!r}")
     return changes
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from orchestrator.api.batch.value_checks import check_choice, check_range
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import FARGATE_MEMBERS
 
@@ -62,8 +63,10 @@ def check_platform(document: Mapping[str, Any], properties: Mapping[str, Any], w
         _check_values(container, where)
         if fargate:
             _check_on_fargate(container, where)
-        elif given := next((key for key in _ONLY_FARGATE if container.get(key)), None):
-            raise ClientError(f"{where}: {given} is for Fargate; add platformCapabilities FARGATE, or leave it out")
+        elif unsupported := next((key for key in _ONLY_FARGATE if container.get(key)), None):
+            raise ClientError(
+                f"{where}: {unsupported} is for Fargate; add platformCapabilities FARGATE, or leave it out"
+            )
 
 
 def _check_values(container: Mapping[str, Any], where: str) -> None:
@@ -71,21 +74,23 @@ def _check_values(container: Mapping[str, Any], where: str) -> None:
     if system != "LINUX":
         raise ClientError(f"{where}: operatingSystemFamily {system[:50]!r} is not supported: nodes run LINUX")
     for member, key, known in _VALUES:
-        if (value := (container.get(member) or {}).get(key)) and value not in known:
-            raise ClientError(f"{where}: {member} {key} is {value[:50]!r}; it is {' or '.join(known)}")
-    if (size := (container.get("ephemeralStorage") or {}).get("sizeInGiB")) is not None and not 21 <= size <= 200:
-        raise ClientError(f"{where}: ephemeralStorage sizeInGiB is {size}; it must be 21 to 200")
+        if value := (container.get(member) or {}).get(key):
+            check_choice(f"{where}: {member} {key}", value, *known)
+    size = (container.get("ephemeralStorage") or {}).get("sizeInGiB")
+    check_range(f"{where}: ephemeralStorage sizeInGiB", size, 21, 200)
 
 
 def _check_on_fargate(container: Mapping[str, Any], where: str) -> None:
     linux = container.get("linuxParameters") or {}
-    given = [
+    unsupported = [
         *(key for key in _ONLY_EC2 if container.get(key)),
         *(f"linuxParameters {key}" for key in _ONLY_EC2_LINUX if linux.get(key) not in (None, [])),
         *(f"volume {each.get('name')!r} of the host" for each in container.get("volumes") or [] if each.get("host")),
     ]
-    if given:
-        raise ClientError(f"{where}: {given[0]} is not for Fargate; leave it out, or use platformCapabilities EC2")
+    if unsupported:
+        raise ClientError(
+            f"{where}: {unsupported[0]} is not for Fargate; leave it out, or use platformCapabilities EC2"
+        )
     needs = {each["type"]: each["value"] for each in container.get("resourceRequirements") or []}
     if "GPU" in needs:
         raise ClientError(f"{where}: Fargate has no GPUs; leave GPU out, or use platformCapabilities EC2")
@@ -107,9 +112,9 @@ def check_resources(resources: Mapping[str, Any]) -> None:
         raise ClientError(f"computeResources type {kind[:50]!r} is not supported; use {', '.join(_TYPES)}")
     if not kind.upper().startswith(FARGATE):
         return
-    given = next((key for key in _ONLY_EC2_RESOURCES if resources.get(key) not in (None, "", [], {})), None)
-    if given is not None:
-        raise ClientError(f"computeResources {given} is not for {kind}; leave it out")
+    unsupported = next((key for key in _ONLY_EC2_RESOURCES if resources.get(key) not in (None, "", [], {})), None)
+    if unsupported is not None:
+        raise ClientError(f"computeResources {unsupported} is not for {kind}; leave it out")
 
 
 def of_environment(document: Mapping[str, Any]) -> bool:
@@ -140,5 +145,5 @@ def check_queue(name: str, documents: Sequence[Mapping[str, Any]], definition: M
 
 def without_effect(definition: Mapping[str, Any], containers: Iterable[Mapping[str, Any]]) -> list[str]:
     """The members of a Fargate job that no engine heeds, by name."""
-    given = {key for container in containers for key in FARGATE_MEMBERS if container.get(key)}
-    return sorted(given | ({"platformCapabilities"} if is_fargate(definition) else set()))
+    unsupported = {key for container in containers for key in FARGATE_MEMBERS if container.get(key)}
+    return sorted(unsupported | ({"platformCapabilities"} if is_fargate(definition) else set()))

@@ -22,10 +22,10 @@ from orchestrator.services.stop import UnknownJob, check_reason, end
 
 def describe_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """DescribeJobs for jobs, nodes (``id#N``, ``arn#N``) and array children (``id:N``); unknown ids are passed over."""
-    wanted, found = [split_reference(reference) for reference in request["jobs"]], []
-    query = select(Job).where(Job.id.in_({job_id for job_id, _ in wanted})).options(selectinload(Job.attempts))
+    requested, found = [split_reference(reference) for reference in request["jobs"]], []
+    query = select(Job).where(Job.id.in_({job_id for job_id, _ in requested})).options(selectinload(Job.attempts))
     jobs = {job.id: job for job in context.session.scalars(query)}
-    for job_id, node in wanted:
+    for job_id, node in requested:
         job = jobs.get(job_id)
         if job is None or not context.actor.may_see(job):
             continue
@@ -48,8 +48,8 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
     Without a status only RUNNING ones are listed. A filter applies to a queue only, and lists jobs in all states.
     """
-    given = [key for key in ("jobQueue", "arrayJobId", "multiNodeJobId") if request.get(key)]
-    if len(given) != 1:
+    named = [key for key in ("jobQueue", "arrayJobId", "multiNodeJobId") if request.get(key)]
+    if len(named) != 1:
         raise ClientError("ListJobs: give exactly one of jobQueue, arrayJobId, multiNodeJobId")
     if (status := request.get("jobStatus")) and status not in list(Status):
         raise ClientError(f"jobStatus is {status[:50]!r}; it is one of {', '.join(Status)}")
@@ -62,18 +62,15 @@ def list_jobs(context: Context, request: dict[str, Any]) -> dict[str, Any]:
         status = request.get("jobStatus", Status.RUNNING)
         query = select(Job).where(Job.parent == job_id, Job.status == status).order_by(Job.array_index, Job.id)
         query = query.options(selectinload(Job.attempts))
-        rows, token = page(
-            context.session, query, request, page_size(request, 1000), (Job.array_index, Job.id), (False, False)
-        )
+        rows, token = page(context.session, query, request, Job.array_index, Job.id, most=1000)
     else:
         queue = context.queue(request["jobQueue"], deleting=True)
         context.actor.check(Operation.LIST_JOBS, JobsOf(queue.name))
         conditions = _conditions(request)
         query = select(Job).where(Job.queue == queue.name, Job.parent.is_(None), *conditions)
         query = query.order_by(Job.created_at.desc(), Job.id.desc()).options(selectinload(Job.attempts))
-        most = 100 if request.get("filters") else 1000
-        keys = (Job.created_at, Job.id)
-        rows, token = page(context.session, query, request, page_size(request, most), keys, (True, True))
+        most, keys = 100 if request.get("filters") else 1000, (Job.created_at, Job.id)
+        rows, token = page(context.session, query, request, *keys, descending=(True, True), most=most)
     return {"jobSummaryList": [_summary(job, context.reason(job)) for job in rows], **token}
 
 
@@ -90,9 +87,9 @@ def _list_nodes(context: Context, request: Mapping[str, Any]) -> dict[str, Any]:
     if job is None or job.kind != "multinode":
         return {"jobSummaryList": []}
     context.actor.check(Operation.LIST_JOBS, job)
-    wanted, reason = request.get("jobStatus", Status.RUNNING), context.reason(job)
+    requested, reason = request.get("jobStatus", Status.RUNNING), context.reason(job)
     with reading(job):
-        nodes = [node for node in range(len(job.gang.nodes)) if node_status(job, node) == wanted]
+        nodes = [node for node in range(len(job.gang.nodes)) if node_status(job, node) == requested]
     token = request.get("nextToken")
     start = decode(token, [int])[0] if token else 0
     if start < 0:

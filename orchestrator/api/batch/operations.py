@@ -10,12 +10,11 @@ from collections.abc import Callable
 from functools import cache
 from typing import Any
 
-from botocore.validate import ParamValidator
 from sqlalchemy.exc import IntegrityError
 from sqlalchemy.orm import Session
 
 from orchestrator.api.batch import compute_environments, definitions, jobs, queues, submission, tags
-from orchestrator.api.batch.service_model import service_model
+from orchestrator.api.batch.service_model import problem_with, service_model
 from orchestrator.api.http import limits
 from orchestrator.control.controller import Controller
 from orchestrator.domain.errors import ClientError
@@ -77,10 +76,8 @@ def validate(operation: str, request: object) -> dict[str, Any]:
     if not isinstance(request, dict):
         raise ClientError(f"{operation}: expected a JSON object")
     limits.check_size(operation, request)
-    report = ParamValidator().validate(request, service_model("batch").operation_model(operation).input_shape)
-    if report.has_errors():
-        message = " ".join(report.generate_report().split())
-        raise ClientError(f"Error executing request, Exception : {message[:2000]}")
+    if problem := problem_with("batch", operation, request):
+        raise ClientError(f"Error executing request, Exception : {problem[:2000]}")
     return request
 
 

@@ -23,20 +23,20 @@ def page(
     session: Session,
     query: Select[Any],
     request: dict[str, Any],
-    size: int,
-    keys: Sequence[InstrumentedAttribute[Any]],
-    descending: Sequence[bool] = (False, True),
+    *keys: InstrumentedAttribute[Any],
+    descending: Sequence[bool] = (False, False),
+    most: int = 100,
 ) -> tuple[list[Any], dict[str, str]]:
     """The rows behind ``nextToken``, and the token of the next page where there is one.
 
     Args:
-        session: The session.
         query: Rows, ordered by ``keys``.
-        request: Holds ``nextToken``.
-        size: Rows a page.
+        request: Holds ``maxResults`` and ``nextToken``.
         keys: The columns of the order; together they are unique.
         descending: Of each key.
+        most: Rows a page.
     """
+    size = page_size(request, most)
     if token := request.get("nextToken"):
         values = decode(token, [key.type.python_type for key in keys])
         query = query.where(behind(keys, values, descending))

@@ -8,8 +8,9 @@ from typing import Any
 from sqlalchemy import select
 
 from orchestrator.api.batch import fargate, validation
-from orchestrator.api.batch.engine_tags import check_engine_tags
-from orchestrator.api.batch.paging import page, page_size
+from orchestrator.api.batch.paging import page
+from orchestrator.api.batch.tags import check_engine_tags
+from orchestrator.api.batch.value_checks import check_choice, check_name, check_range, check_tags
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.control.snapshot import open_attempts
 from orchestrator.control.usage import utilization
@@ -30,8 +31,8 @@ _REASONS = (
 def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """CreateJobQueue."""
     name = request["jobQueueName"]
-    validation.check_name("jobQueueName", name)
-    validation.check_tags(request.get("tags") or {})
+    check_name("jobQueueName", name)
+    check_tags(request.get("tags") or {})
     context.actor.check(Operation.CREATE_JOB_QUEUE, Shared())
     if context.session.get(JobQueue, name):
         raise ClientError(f"Job queue {name} exists already; UpdateJobQueue changes it")
@@ -48,7 +49,7 @@ def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
         )
     check_engine_tags(context, queue, queue.tags)
     if policy := request.get("schedulingPolicyArn"):
-        queue.policy = _policy(context, policy)
+        queue.policy = context.named(SchedulingPolicy, policy).name
     context.session.add(queue)
     return {"jobQueueName": name, "jobQueueArn": queue_arn(name)}
 
@@ -58,7 +59,7 @@ def describe_job_queues(context: Context, request: dict[str, Any]) -> dict[str, 
     query = select(JobQueue).order_by(JobQueue.name)
     if named := request.get("jobQueues"):
         query = query.where(JobQueue.name.in_([plain_name(each, "job-queue") for each in named]))
-    rows, token = page(context.session, query, request, page_size(request, 100), (JobQueue.name,), (False,))
+    rows, token = page(context.session, query, request, JobQueue.name)
     return {"jobQueues": [_describe(context, queue) for queue in rows], **token}
 
 
@@ -71,7 +72,7 @@ def update_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
             raise ClientError(
                 f"Job queue {queue.name} is first in, first out; a scheduling policy can't be added to it"
             )
-        queue.policy = _policy(context, policy)
+        queue.policy = context.named(SchedulingPolicy, policy).name
     _check_kind(request)
     _apply(context, queue, request)
     return {"jobQueueName": queue.name, "jobQueueArn": queue_arn(queue.name)}
@@ -123,12 +124,10 @@ def _utilization(context: Context, queue: JobQueue) -> dict[str, Any]:
 def _apply(context: Context, queue: JobQueue, request: Mapping[str, Any]) -> None:
     """The part shared by CreateJobQueue and UpdateJobQueue."""
     if (state := request.get("state")) is not None:
-        if state not in ("ENABLED", "DISABLED"):
-            raise ClientError(f"state is {state[:50]!r}; it is ENABLED or DISABLED")
+        check_choice("state", state, "ENABLED", "DISABLED")
         queue.state = state
     if (priority := request.get("priority")) is not None:
-        if not 0 <= priority <= 1_000_000:
-            raise ClientError(f"priority is {priority}; it must be 0 to 1000000")
+        check_range("priority", priority, 0, 1_000_000)
         queue.priority = priority
     if order := request.get("computeEnvironmentOrder"):
         queue.sent_order = _checked_order(context, order)
@@ -161,17 +160,11 @@ def _checked_order(context: Context, order: Sequence[Mapping[str, Any]]) -> list
             f"computeEnvironmentOrder has {len(order)} entries; a queue has at most {_MOST_COMPUTE_ENVIRONMENTS}"
         )
     for each in order:
-        if not 0 <= each["order"] < 2**31:
-            raise ClientError(f"computeEnvironmentOrder order is {each['order']}; it must be 0 to {2**31 - 1}")
+        check_range("computeEnvironmentOrder order", each["order"], 0, 2**31 - 1)
     names = [plain_name(each["computeEnvironment"], "compute-environment") for each in order]
     if len(set(names)) != len(names) or len({each["order"] for each in order}) != len(order):
         raise ClientError("computeEnvironmentOrder: every compute environment and every order once")
-    kinds = set()
-    for name in names:
-        if (found := context.session.get(ComputeEnvironment, name)) is None:
-            raise ClientError(f"Compute environment {name[:200]} does not exist")
-        kinds.add(fargate.of_environment(found.document))
-    if len(kinds) > 1:
+    if len({fargate.of_environment(context.named(ComputeEnvironment, name).document) for name in names}) > 1:
         raise ClientError("computeEnvironmentOrder: compute environments of EC2 and of Fargate can't be mixed")
     return [{"order": each["order"], "computeEnvironment": name} for each, name in zip(order, names, strict=True)]
 
@@ -182,20 +175,10 @@ def _limits(limits: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             raise ClientError(
                 f"jobStateTimeLimitActions reason {limit['reason'][:100]!r}: it is {' or '.join(_REASONS)}"
             )
-        if not 600 <= limit["maxTimeSeconds"] <= 86400:
-            raise ClientError(
-                f"jobStateTimeLimitActions maxTimeSeconds is {limit['maxTimeSeconds']}; it must be 600 to 86400"
-            )
+        check_range("jobStateTimeLimitActions maxTimeSeconds", limit["maxTimeSeconds"], 600, 86400)
         if limit["state"] != "RUNNABLE" or limit["action"] != "CANCEL":
             raise ClientError("jobStateTimeLimitActions: the state is RUNNABLE and the action CANCEL")
     return [dict(limit) for limit in limits]
-
-
-def _policy(context: Context, arn: str) -> str:
-    policy = context.session.get(SchedulingPolicy, plain_name(arn, "scheduling-policy"))
-    if policy is None:
-        raise ClientError(f"Scheduling policy {arn[:300]} does not exist")
-    return policy.name
 
 
 def _describe(context: Context, queue: JobQueue) -> dict[str, Any]:

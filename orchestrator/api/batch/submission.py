@@ -7,6 +7,7 @@ from typing import Any
 
 from orchestrator.api.batch import fargate, validation
 from orchestrator.api.batch.members import check_consumables
+from orchestrator.api.batch.value_checks import check_name, check_tags
 from orchestrator.control.compute_environments import environments_of
 from orchestrator.domain.errors import ClientError
 from orchestrator.persistence.batch_models import Job
@@ -28,9 +29,9 @@ def submit_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 def _submission(context: Context, request: Mapping[str, Any]) -> Submission:
     """The request as it is meant. Raises ClientError."""
-    validation.check_name("jobName", request["jobName"])
+    check_name("jobName", request["jobName"])
     validation.check_tries(request)
-    validation.check_tags(request.get("tags") or {})
+    check_tags(request.get("tags") or {})
     queue, override = context.queue(request["jobQueue"]), request.get("schedulingPriorityOverride")
     try:
         share = open_queue(context, queue, request.get("shareIdentifier"), override)
@@ -87,11 +88,11 @@ def _properties(document: Mapping[str, Any], request: Mapping[str, Any]) -> dict
 
 def _waits(context: Context, request: Mapping[str, Any], size: int | None) -> Sequence[Wait]:
     """``dependsOn``, checked; ``size`` of the array that waits, None for another job."""
-    wanted = request.get("dependsOn") or []
-    if len(wanted) > _MOST_DEPENDENCIES:
-        raise ClientError(f"dependsOn has {len(wanted)} entries; at most {_MOST_DEPENDENCIES}")
+    dependencies = request.get("dependsOn") or []
+    if len(dependencies) > _MOST_DEPENDENCIES:
+        raise ClientError(f"dependsOn has {len(dependencies)} entries; at most {_MOST_DEPENDENCIES}")
     found: dict[str, Wait] = {}
-    for entry in wanted:
+    for entry in dependencies:
         kind, reference = entry.get("type"), entry.get("jobId")
         if kind not in (None, "N_TO_N", "SEQUENTIAL"):
             raise ClientError(f"dependsOn type is {kind[:50]!r}; it is N_TO_N or SEQUENTIAL")

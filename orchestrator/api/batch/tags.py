@@ -1,16 +1,21 @@
-"""The Batch API's operations on tags: TagResource, UntagResource, ListTagsForResource."""
+"""Tags: TagResource, UntagResource, ListTagsForResource; and what tags ``muster:…`` may say of engines and of retention."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from orchestrator.api.batch import validation
-from orchestrator.api.batch.engine_tags import check_engine_tags
+from orchestrator.api.batch.value_checks import check_tags
+from orchestrator.control.compute_environments import ENGINE_TAG, engine_named_by, environments_of
 from orchestrator.domain.errors import ClientError
+from orchestrator.domain.retention import TAG, rule_of
+from orchestrator.engines.api import EngineError
+from orchestrator.engines.installed import ENGINES
+from orchestrator.engines.installed import check_tags as check_options
 from orchestrator.persistence.batch_models import ComputeEnvironment, Job, JobDefinition, JobQueue, SchedulingPolicy
 from orchestrator.services.arns import split_arn
 from orchestrator.services.context import Context
 from orchestrator.services.permissions import Operation
+from shared_store.contract.error_text import nearest
 
 _TABLES = {
     "job": Job,
@@ -24,7 +29,7 @@ def tag_resource(context: Context, request: dict[str, Any]) -> dict[str, Any]:
     """Add tags, or replace their values."""
     resource = _resource(context, request["resourceArn"], Operation.TAG_RESOURCE)
     tags = {**resource.tags, **request["tags"]}
-    validation.check_tags(tags)
+    check_tags(tags)
     check_engine_tags(context, resource, tags)
     resource.tags = tags
     return {}
@@ -64,3 +69,30 @@ def _find(context: Context, arn: str) -> Any:
     if found is None:
         raise ClientError(f"Resource {arn[:300]} does not exist")
     return found
+
+
+def check_engine_tags(context: Context, resource: object, tags: dict[str, str]) -> None:
+    """Raises ClientError where the resource can't have these tags, for an option that is misspelt or has a wrong value."""
+    first = context.controller.engines.names[0]
+    if isinstance(resource, ComputeEnvironment):
+        engines = [engine_named_by(tags, first)]
+    elif isinstance(resource, JobQueue):
+        if (rule := tags.get(TAG)) is not None:
+            tags = {tag: value for tag, value in tags.items() if tag != TAG}
+            try:
+                rule_of(rule)
+            except ValueError as error:
+                raise ClientError(f"tag {TAG}: {error}") from None
+        engines = [engine_named_by(each.tags, first) for each in environments_of(context.session, resource)]
+    else:
+        return
+    if not any(tag.startswith("muster:") for tag in tags):
+        return
+    if isinstance(resource, ComputeEnvironment) and engines[0] not in (*ENGINES, *context.controller.engines.names):
+        raise ClientError(
+            f"tag {ENGINE_TAG} is {engines[0][:100]!r}: there is no such engine; {nearest(engines[0], ENGINES)}"
+        )
+    try:
+        check_options(tags, [each for each in engines if each in ENGINES], of_a_queue=isinstance(resource, JobQueue))
+    except (ValueError, EngineError) as error:
+        raise ClientError(str(error)) from None

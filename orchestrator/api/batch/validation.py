@@ -9,49 +9,24 @@ from typing import Any
 
 from orchestrator.api.batch.ecs import container_name, from_ecs, override_from_ecs
 from orchestrator.api.batch.members import check_consumables, check_members
+from orchestrator.api.batch.value_checks import check_range
 from orchestrator.api.http.limits import LARGEST_COMMANDS
 from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import MOST_NODES, target_nodes
 from orchestrator.domain.gang_checks import CheckedGang, checked_gang
 from shared_store.contract.error_text import shown
 
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,127}")
 _REFERENCE = re.compile(r"Ref::([A-Za-z0-9_-]+)")
-_MOST_NODES, _MOST_RANGES, _MOST_TAGS, _MOST_CONDITIONS = 1000, 5, 50, 5
+_MOST_NODES, _MOST_RANGES, _MOST_CONDITIONS = 1000, 5, 5
 _SHORTEST_TIMEOUT = 60
 NO_KUBERNETES = "is not supported: no engine is a Kubernetes cluster;"
-
-
-def check_name(key: str, name: str) -> None:
-    """A name as AWS takes it: letters, digits, hyphens, underscores, a letter or digit first, at most 128."""
-    if not _NAME.fullmatch(name):
-        raise ClientError(
-            f"{key} {name[:200]!r}: up to 128 letters, digits, hyphens and underscores, a letter or digit first"
-        )
-
-
-def check_tags(tags: Mapping[str, str]) -> None:
-    """At most 50 tags, keys of 1 to 128 characters that do not begin with ``aws:``, values of at most 256."""
-    if len(tags) > _MOST_TAGS:
-        raise ClientError(f"{len(tags)} tags; a resource has at most {_MOST_TAGS}")
-    for key, value in tags.items():
-        if not 1 <= len(key) <= 128 or key.lower().startswith("aws:") or len(value) > 256:
-            raise ClientError(
-                f"tag {key[:130]!r}: keys have 1 to 128 characters and don't begin with aws:, values have at most 256"
-            )
-
-
-def check_priority(key: str, value: int | None) -> None:
-    if value is not None and not 0 <= value <= 9999:
-        raise ClientError(f"{key} is {value}; it must be 0 to 9999")
 
 
 def check_tries(request: Mapping[str, Any]) -> None:
     """``retryStrategy`` and ``timeout`` of a definition or a submission."""
     retry, timeout = request.get("retryStrategy") or {}, request.get("timeout") or {}
     attempts, conditions = retry.get("attempts"), retry.get("evaluateOnExit") or []
-    if attempts is not None and not 1 <= attempts <= 10:
-        raise ClientError(f"retryStrategy attempts is {attempts}; it must be 1 to 10")
+    check_range("retryStrategy attempts", attempts, 1, 10)
     if conditions and attempts is None:
         raise ClientError("retryStrategy evaluateOnExit needs attempts too")
     if len(conditions) > _MOST_CONDITIONS:
@@ -66,14 +41,14 @@ def check_tries(request: Mapping[str, Any]) -> None:
 def _check_condition(condition: Mapping[str, str]) -> None:
     if condition["action"].upper() not in ("RETRY", "EXIT"):
         raise ClientError(f"retryStrategy evaluateOnExit action is {condition['action'][:50]!r}; it is RETRY or EXIT")
-    given = {key: condition[key] for key in ("onExitCode", "onReason", "onStatusReason") if condition.get(key)}
-    if not given:
+    present = {key: condition[key] for key in ("onExitCode", "onReason", "onStatusReason") if condition.get(key)}
+    if not present:
         raise ClientError("retryStrategy evaluateOnExit: an entry needs onExitCode, onReason or onStatusReason")
-    for key, pattern in given.items():
+    for key, pattern in present.items():
         if len(pattern) > 512 or "*" in pattern[:-1]:
             raise ClientError(f"{key} {pattern[:50]!r}: at most 512 characters, with a * at the end only")
-    if not re.fullmatch(r"[0-9]*\*?", given.get("onExitCode", "*")):
-        raise ClientError(f"onExitCode {given['onExitCode'][:50]!r}: digits, with a * at the end at most")
+    if not re.fullmatch(r"[0-9]*\*?", present.get("onExitCode", "*")):
+        raise ClientError(f"onExitCode {present['onExitCode'][:50]!r}: digits, with a * at the end at most")
 
 
 def check_nodes(properties: Mapping[str, Any], kind: str) -> CheckedGang:
@@ -182,14 +157,14 @@ def _where(entry: Mapping[str, Any], kind: str) -> str:
 
 
 def _in_container(entry: Mapping[str, Any], where: str) -> dict[str, Any]:
-    given = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
-    if "eksProperties" in given:
+    present = [key for key in ("container", "ecsProperties", "eksProperties") if entry.get(key)]
+    if "eksProperties" in present:
         raise ClientError(f"{where}: eksProperties {NO_KUBERNETES} use container or ecsProperties")
-    if given not in (["container"], ["ecsProperties"]):
+    if present not in (["container"], ["ecsProperties"]):
         raise ClientError(f"{where}: give container or ecsProperties, and only one of them")
     check_consumables(entry, where)
     rest = {key: value for key, value in entry.items() if key not in ("container", "ecsProperties")}
-    if given == ["container"]:
+    if present == ["container"]:
         return {**rest, "container": dict(entry["container"])}
     ecs = entry["ecsProperties"]
     return {**rest, "container": from_ecs(ecs, where), "ecs": container_name(ecs)}

@@ -71,26 +71,26 @@ class Access:
         with_token = " or MUSTER_TOKEN" if self.token else ""
         return f"open to callers with a key{with_token}; `muster keys list` shows the keys"
 
-    def bearer(self, given: str) -> Actor:
+    def bearer(self, credential: str) -> Actor:
         """The owner of this token, or of ``ACCESS_KEY_ID:SECRET`` of a key. Raises Refusal."""
-        if self.own_token and hmac.compare_digest(given.encode(), self.own_token.encode()):
+        if self.own_token and hmac.compare_digest(credential.encode(), self.own_token.encode()):
             return CONTROLLER
-        return self._proven(given)[1]
+        return self._proven(credential)[1]
 
-    def sign_in(self, given: str) -> str:
+    def sign_in(self, credential: str) -> str:
         """Open a session for the server's token or a key; its text reveals nothing of the secret. Raises Refusal."""
-        if self.is_new(given.partition(":")[0]):
+        if self.is_new(credential.partition(":")[0]):
             self.look_again()
-        name, _ = self._proven(given)
+        name, _ = self._proven(credential)
         claim = f"{name}.{int(time.time()) + SESSION}.{secrets.token_urlsafe(16)}"
         return f"{claim}.{self._seal(name, claim)}"
 
-    def session(self, given: str) -> Actor | None:
+    def session(self, credential: str) -> Actor | None:
         """The owner of this session; None where it has expired, was closed, or its key is gone."""
-        claim, _, seal = given.rpartition(".")
+        claim, _, seal = credential.rpartition(".")
         name, _, rest = claim.partition(".")
         expected = self._seal(name, claim)
-        if expected is None or not hmac.compare_digest(seal.encode(), expected.encode()) or given in self._ended:
+        if expected is None or not hmac.compare_digest(seal.encode(), expected.encode()) or credential in self._ended:
             return None
         if int(rest.partition(".")[0]) < time.time():
             return None
@@ -111,14 +111,14 @@ class Access:
         of_token = self.token is not None and actor == Actor("MUSTER_TOKEN")
         return of_token or any(actor_of_key(key) == actor for key in self.known().values())
 
-    def sign_out(self, given: str) -> None:
+    def sign_out(self, credential: str) -> None:
         """Close a session; a restart of the server forgets that, and the session's own end does not."""
         now = time.time()
         for each, end in list(self._ended.items()):  # not a new dict: others close theirs meanwhile
             if end <= now:
                 self._ended.pop(each, None)
-        if self.session(given) is not None:
-            self._ended[given] = now + SESSION
+        if self.session(credential) is not None:
+            self._ended[credential] = now + SESSION
 
     def form_token(self, session: str) -> str:
         """The token that a form of the console must send back: other web pages can't know it. ``session``: empty where none is needed."""
@@ -132,11 +132,11 @@ class Access:
             return None
         return hmac.new(self.console_secret, f"session\0{secret}\0{claim}".encode(), sha256).hexdigest()
 
-    def _proven(self, given: str) -> tuple[str, Actor]:
+    def _proven(self, credential: str) -> tuple[str, Actor]:
         """The credential's name in sessions, and its owner. Raises Refusal."""
-        if self.token and hmac.compare_digest(given.encode(), self.token.encode()):
+        if self.token and hmac.compare_digest(credential.encode(), self.token.encode()):
             return _TOKEN, Actor("MUSTER_TOKEN")
-        access_key_id, _, secret = given.partition(":")
+        access_key_id, _, secret = credential.partition(":")
         key = self.known().get(access_key_id)
         if key and hmac.compare_digest(secret.encode(), key.secret.encode()):
             return access_key_id, actor_of_key(key)

@@ -1,4 +1,4 @@
-"""Streams of answers that go on while their client listens: counted by key, and given what is new by a pool of threads."""
+"""Streams of answers that go on while their client listens: counted by key, and fed by a pool of threads."""
 
 from __future__ import annotations
 

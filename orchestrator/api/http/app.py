@@ -53,13 +53,8 @@ def create_app(
     app.include_router(native.router)
     app.state.access, app.state.limit = access or Access(), limit or RateLimit()
     app.add_middleware(Guard, access=app.state.access, limit=app.state.limit)
-    app.add_exception_handler(RequestError, _client_error)
-    app.add_exception_handler(RequestValidationError, _invalid)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(DataError, _refused_by_database)
-    app.add_exception_handler(Unavailable, _unavailable)
-    app.add_exception_handler(PluginError, _broken_plugin)
-    app.add_exception_handler(DamagedFile, _damaged_file)
+    for kind in (RequestError, RequestValidationError, HTTPException, DataError, Unavailable, PluginError, DamagedFile):
+        app.add_exception_handler(kind, _refused)
 
     @app.get("/healthz")
     async def healthz() -> JSONResponse:
@@ -122,36 +117,20 @@ async def _body(request: Request) -> Any:
         raise ClientError("the request is not JSON") from None
 
 
-async def _client_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestError)
-    return error_response(str(error), error.status, kind_of(error))
-
-
-async def _invalid(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    return error_response(f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}", 400)
-
-
-async def _http_error(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, HTTPException)
-    return error_response(f"{request.method} {request.url.path}: {error.detail}", error.status_code)
-
-
-async def _refused_by_database(request: Request, error: Exception) -> JSONResponse:
-    """A zero byte, say, which PostgreSQL can't store nor look for."""
-    assert isinstance(error, DataError)
-    return error_response(f"the database refuses a value ({str(error.orig).splitlines()[0][:200]})", 400)
-
-
-async def _damaged_file(request: Request, error: Exception) -> JSONResponse:
-    """Files on the volume are written by jobs and may hold anything: that is no error of the server."""
-    return error_response(f"the store holds a damaged file: {error}", 409)
-
-
-async def _broken_plugin(request: Request, error: Exception) -> JSONResponse:
+async def _refused(request: Request, error: Exception) -> JSONResponse:
+    """The response to a request that was refused, or can't be carried out now."""
+    match error:
+        case RequestError():
+            return error_response(str(error), error.status, kind_of(error))
+        case RequestValidationError():
+            first = error.errors()[0]
+            return error_response(f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}", 400)
+        case HTTPException():
+            return error_response(f"{request.method} {request.url.path}: {error.detail}", error.status_code)
+        case DataError():  # a zero byte, say, which PostgreSQL can't store nor look for
+            return error_response(f"the database refuses a value ({str(error.orig).splitlines()[0][:200]})", 400)
+        case DamagedFile():  # jobs write files on the volume, which may hold anything: that is not an error of the server
+            return error_response(f"the store holds a damaged file: {error}", 409)
+        case Unavailable():
+            return error_response(str(error), 503, "ServerException")
     return error_response(str(error), 500, "ServerException")
-
-
-async def _unavailable(request: Request, error: Exception) -> JSONResponse:
-    return error_response(str(error), 503, "ServerException")

@@ -1,14 +1,16 @@
-"""The caller of a loopback connection: the user at its other end, from the kernel's table of sockets.
+"""The caller of a local connection: the user at its other end.
 
 A web server that listens on loopback is open to every user of the machine. While no key is demanded, requests are taken from
-processes of the controller's own user alone, whatever they send. Another user's process can't pretend: the table has the user
-who opened the socket, and the two addresses and ports of a connection name one socket.
+processes of the controller's own user alone, whatever they send. The command comes through a Unix socket, whose peer the kernel
+names (``SO_PEERCRED``). Browsers and AWS's clients come over TCP, where it does not: there the kernel's table of sockets has the
+user who opened the other end, and the two addresses and ports of a connection name one socket.
 """
 
 from __future__ import annotations
 
 import ipaddress
 import pwd
+import socket
 import struct
 from functools import cache
 from pathlib import Path
@@ -16,50 +18,54 @@ from pathlib import Path
 from starlette.concurrency import run_in_threadpool
 
 _TABLES = ("/proc/net/tcp", "/proc/net/tcp6")
-_LOOKS = 3
-"""The kernel gives the table out in pieces, and a row may slip through while others come and go."""
+_TRIES = 3
+"""The kernel hands the table out in pieces, and a row may slip through while others come and go."""
 Address = tuple[str, int]
 
 
 class Caller:
     """The process at the other end of one connection."""
 
-    def __init__(self, client: Address, server: Address) -> None:
-        """``client``, ``server``: IP address and port of its end and of ours."""
-        self._client, self._server = client, server
-        self._uid: int | None = None
-        self._is_known = False
+    def __init__(self, client: Address | None, server: Address | None, uid: int | None = None) -> None:
+        """``client``, ``server``: IP address and port of its end and of ours; ``uid``: its user, where that is known already."""
+        self._client, self._server, self._uid = client, server, uid
+        self._is_known = uid is not None
+
+    @classmethod
+    def of_unix_socket(cls, connection: socket.socket) -> Caller:
+        """The caller of a connection to a Unix socket."""
+        return cls(None, None, struct.unpack("3i", connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[1])
 
     async def uid(self) -> int | None:
         """The user who opened the socket; None where this machine's table does not have it. Looked up once a connection.
 
-        A socket that its process has closed already counts as not there: the kernel shows it as root's.
+        A socket that its process has closed already counts as absent: the kernel shows it as root's.
         """
-        if not self._is_known:
-            self._uid = await run_in_threadpool(self._find)
+        if not self._is_known and self._client and self._server:
+            self._uid = await run_in_threadpool(_find, self._client, self._server)
             self._is_known = True
         return self._uid
 
-    def _find(self) -> int | None:
-        for _ in range(_LOOKS):
-            for table in _TABLES:
-                if (uid := self._look(Path(table))) is not None:
-                    return uid
-        return None
 
-    def _look(self, table: Path) -> int | None:
-        try:
-            content = table.read_bytes()
-        except OSError:
-            return None
-        for client, server in zip(_forms(self._client), _forms(self._server), strict=False):
-            start = content.find(f" {client} {server} ".encode())
-            if start >= 0:
-                # state, queues, timer, retransmits, uid, timeout, inode
-                fields = content[start:].split(b"\n", 1)[0].split()[2:]
-                if fields[6] != b"0":  # else it has no owner any more
-                    return int(fields[4])
+def _find(client: Address, server: Address) -> int | None:
+    return next(
+        (uid for _ in range(_TRIES) for table in _TABLES if (uid := _user_in(table, client, server)) is not None), None
+    )
+
+
+def _user_in(table: str, client: Address, server: Address) -> int | None:
+    try:
+        content = Path(table).read_bytes()
+    except OSError:
         return None
+    for theirs, ours in zip(_forms(client), _forms(server), strict=False):
+        start = content.find(f" {theirs} {ours} ".encode())
+        if start >= 0:
+            # state, queues, timer, retransmits, uid, timeout, inode
+            fields = content[start:].split(b"\n", 1)[0].split()[2:]
+            if fields[6] != b"0":  # else it has no owner any more
+                return int(fields[4])
+    return None
 
 
 def _forms(address: Address) -> list[str]:

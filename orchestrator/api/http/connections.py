@@ -34,7 +34,7 @@ _PIECE = 16 << 10
 """Bytes that are parsed at once. A head of more than h11's limit (64 KiB) and one piece is always refused."""
 _MOST_DESCRIPTORS = 65_536
 _MOST_CONNECTIONS = 4096
-_SAID = 60.0
+_QUIET = 60.0
 """Seconds between two lines about the same trouble."""
 
 log = logging.getLogger("muster.api")
@@ -43,10 +43,10 @@ log = logging.getLogger("muster.api")
 def raise_descriptor_limit() -> int:
     """Raise this process's limit of open files as far as it may, at most to 65,536; returns the limit."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _MOST_DESCRIPTORS)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-        return wanted
+    target = _MOST_DESCRIPTORS if hard == resource.RLIM_INFINITY else min(hard, _MOST_DESCRIPTORS)
+    if soft != resource.RLIM_INFINITY and soft < target:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (target, hard))
+        return target
     return _MOST_DESCRIPTORS if soft == resource.RLIM_INFINITY else soft
 
 
@@ -65,7 +65,7 @@ class Connections:
         self._peers: dict[str, int] = {}
         self._waiting: dict[str, dict[Connection, None]] = {}
         """By peer, the longest first: those whose request is not complete, or whose answer is not read."""
-        self._count, self._said = 0, -_SAID
+        self._count, self._logged = 0, -_QUIET
 
     def admit(self, connection: Connection) -> bool:
         """Count a new connection; where there are too many, another gives way. False where none can."""
@@ -79,10 +79,10 @@ class Connections:
         else:
             self._add(connection)
             return True
-        if time.monotonic() - self._said > _SAID:
-            self._said = time.monotonic()
+        if time.monotonic() - self._logged > _QUIET:
+            self._logged = time.monotonic()
             log.warning(
-                "%d connections are open, %d of them from %s; those that have waited longest for their client are closed",
+                "%d connections are open, %d of them from %s; those that have waited for their client longest are closed first",
                 *(self._count, self._peers.get(peer, 0), peer),
             )
         if victim is None:
@@ -137,13 +137,14 @@ class Connection(H11Protocol):
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.peer = self.client[0] if self.client else ""
-        if self.client and self.server and self.server[1] is not None:
-            caller = Caller(self.client, (self.server[0], self.server[1]))
-            self.app_state = {**self.app_state, "caller": caller}  # in the state of each of its requests
+        connection = transport.get_extra_info("socket")
+        is_local = connection.family == socket.AF_UNIX
+        caller = Caller.of_unix_socket(connection) if is_local else Caller(self.client, self.server)  # type: ignore[arg-type]
+        self.app_state = {**self.app_state, "caller": caller}  # in the state of each of its requests
         if not self._connections.admit(self):
             self._refuse()
             return
-        if (connection := transport.get_extra_info("socket")) is not None and connection.family != socket.AF_UNIX:
+        if not is_local:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
         self._look()
 
@@ -172,7 +173,8 @@ class Connection(H11Protocol):
 
     def resume_writing(self) -> None:
         super().resume_writing()
-        self._read_on()
+        if not self.transport.is_closing():  # else the rest must still be sent
+            self._read_on()
         if self._phase == "answer":
             self._connections.has_request(self)
 
@@ -222,15 +224,9 @@ class Connection(H11Protocol):
 
     def _close(self) -> None:
         """Close when all is sent, or when nothing has been sent for a while."""
+        self._read_on()
         self.transport.close()
-        self._flush(self.transport.get_write_buffer_size() + 1)
-
-    def _flush(self, before: int) -> None:
-        left = self.transport.get_write_buffer_size()
-        if left < before:
-            self._deadline = self.loop.call_later(_FLUSH_TIMEOUT, self._flush, left)
-        else:
-            self.transport.abort()
+        self._await_reader(self.transport.get_write_buffer_size() + 1)
 
     def _refuse(self) -> None:
         message = "too many connections are open; close some, or try again later"
@@ -240,7 +236,7 @@ class Connection(H11Protocol):
         self._close()
 
     def _should_upgrade(self) -> bool:
-        return False  # there is no websocket here, and uvicorn would log each attempt
+        return False  # the server takes no websockets, and uvicorn would log each attempt
 
 
 class Serving(uvicorn.Server):
@@ -257,16 +253,16 @@ class Seldom(logging.Filter):
 
     def __init__(self, *messages: str) -> None:
         super().__init__()
-        self._said = dict.fromkeys(messages, -_SAID)
+        self._logged = dict.fromkeys(messages, -_QUIET)
 
     def filter(self, record: logging.LogRecord) -> bool:
-        message = next((each for each in self._said if each in str(record.msg)), None)
+        message = next((each for each in self._logged if each in str(record.msg)), None)
         if message is None:
             return True
         record.exc_info = record.exc_text = None
         record.msg, record.args = str(record.msg).splitlines()[0], ()
         now = time.monotonic()
-        if now - self._said[message] < _SAID:
+        if now - self._logged[message] < _QUIET:
             return False
-        self._said[message] = now
+        self._logged[message] = now
         return True

@@ -54,27 +54,27 @@ def refusal(service: str, headers: Mapping[str, str]) -> Response:
         "AWS_ENDPOINT_URL_BATCH and AWS_ENDPOINT_URL_CLOUDWATCH_LOGS instead"
     )
     kind, identifier = headers.get("content-type", ""), str(uuid.uuid4())
-    given = {"x-amzn-requestid": identifier}
+    common = {"x-amzn-requestid": identifier}
     if _CBOR in headers.get("smithy-protocol", ""):
         body = _cbor({"__type": "UnknownOperationException", "message": message})
-        return Response(body, 400, {**given, "smithy-protocol": _CBOR}, "application/cbor")
+        return Response(body, 400, {**common, "smithy-protocol": _CBOR}, "application/cbor")
     if kind.startswith("application/x-amz-json"):
         code = "UnknownOperationException"
-        return JSONResponse({"__type": code, "message": message}, 400, {**given, "x-amzn-errortype": code}, kind)
+        return JSONResponse({"__type": code, "message": message}, 400, {**common, "x-amzn-errortype": code}, kind)
     text = escape(message)
     if service == "ec2":
         error = f"<Errors><Error><Code>InvalidAction</Code><Message>{text}</Message></Error></Errors>"
-        return _xml(f"<Response>{error}<RequestID>{identifier}</RequestID></Response>", 400, given)
+        return _xml(f"<Response>{error}<RequestID>{identifier}</RequestID></Response>", 400, common)
     if service == "s3" or service.startswith("s3-"):
         error = f"<Code>NotImplemented</Code><Message>{text}</Message><RequestId>{identifier}</RequestId>"
-        return _xml(f"<Error>{error}</Error>", 501, {**given, "x-amz-request-id": identifier})
+        return _xml(f"<Error>{error}</Error>", 501, {**common, "x-amz-request-id": identifier})
     if kind.startswith(_FORM) or service in ("route53", "cloudfront"):
         error = f"<Error><Type>Sender</Type><Code>InvalidAction</Code><Message>{text}</Message></Error>"
         body_text = f"<ErrorResponse>{error}<RequestId>{identifier}</RequestId></ErrorResponse>"
-        return _xml(body_text, 400, given)
+        return _xml(body_text, 400, common)
     code = "UnknownOperationException"
     content = json.dumps({"__type": code, "message": message})
-    return Response(content, 400, {**given, "x-amzn-errortype": code}, "application/json")
+    return Response(content, 400, {**common, "x-amzn-errortype": code}, "application/json")
 
 
 def _xml(body: str, status: int, headers: Mapping[str, str]) -> Response:
@@ -84,8 +84,8 @@ def _xml(body: str, status: int, headers: Mapping[str, str]) -> Response:
 def _cbor(value: Mapping[str, str]) -> bytes:
     """A map of texts in CBOR (RFC 8949), of fewer than 24 entries."""
 
-    def text(given: str) -> bytes:
-        raw = given.encode()
+    def text(value: str) -> bytes:
+        raw = value.encode()
         return b"\x79" + len(raw).to_bytes(2) + raw
 
     return bytes([0xA0 + len(value)]) + b"".join(text(key) + text(each) for key, each in value.items())

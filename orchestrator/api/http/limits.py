@@ -37,7 +37,7 @@ MOST = {
 }
 """Entries of these lists of a request, as on AWS."""
 RATE = 1000
-"""Requests per second that one client may send for long, unless the server is told otherwise."""
+"""Requests per second that one client may send for long, unless `muster serve` sets another rate."""
 FAILURES = 50
 """Requests per second with a wrong token, key or signature that one address may send for long, twice as many at once."""
 _SUBMISSIONS = ("submitjob", "POST /api/jobs")
@@ -70,9 +70,9 @@ def check_size(operation: str, request: Mapping[str, Any]) -> None:
     Raises ClientError, naming the limit.
     """
     for (limited, member), most in MOST.items():
-        given = request.get(member) if limited == operation else None
-        if isinstance(given, list) and len(given) > most:
-            raise ClientError(f"{operation} takes at most {most} {member}, not {len(given)}")
+        entries = request.get(member) if limited == operation else None
+        if isinstance(entries, list) and len(entries) > most:
+            raise ClientError(f"{operation} takes at most {most} {member}, not {len(entries)}")
     count, level = 0, [request]
     for _ in range(DEEPEST):
         count += len(level)
@@ -93,14 +93,14 @@ def _too_large(operation: str, limit: int) -> ClientError:
 
 
 class RequestBody:
-    """The body of an HTTP request: read whole within its limit, then given to the application as if it were just coming."""
+    """The body of an HTTP request: read whole within its limit, then handed to the application as if it were just coming."""
 
     def __init__(self, receive: Receive, declared: str | None, operation: str) -> None:
         """``declared``: the Content-Length, where there is one. ``operation``: in lower case; some have a limit of their own."""
         self._receive, self._declared, self._operation = receive, declared, operation
         self._limit = LARGEST.get(operation, LARGEST_BODY)
         self._whole: bytes | None = None
-        self._given = False
+        self._delivered = False
 
     async def read(self) -> bytes:
         """All of it. Raises ClientError where it is too large (and keeps no more than the limit), ClientDisconnect."""
@@ -125,9 +125,9 @@ class RequestBody:
 
     async def receive(self) -> Message:
         """For the application: the body in one message, then the client's further messages (its disconnect)."""
-        if self._whole is None or self._given:
+        if self._whole is None or self._delivered:
             return await self._receive()
-        self._given = True
+        self._delivered = True
         return {"type": "http.request", "body": self._whole, "more_body": False}
 
 
@@ -157,12 +157,19 @@ class RateLimit:
             return None
         return f"Too Many Requests: {address} sends more than {FAILURES} requests per second with a wrong token or key"
 
+    def fails_too_often(self, address: str) -> bool:
+        """Whether :meth:`refusal_of_failures` would have a reason now; counts nothing."""
+        return self._tokens((address, "failures"), FAILURES, time.monotonic()) < 1
+
+    def _tokens(self, bucket: tuple[str, str], rate: int, now: float) -> float:
+        tokens, counted = self._buckets.get(bucket, (2.0 * rate, now))
+        return min(2.0 * rate, tokens + (now - counted) * rate)
+
     def _take(self, bucket: tuple[str, str], rate: int) -> bool:
         if rate <= 0:
             return True
         now = time.monotonic()
-        tokens, counted = self._buckets.get(bucket, (2.0 * rate, now))
-        tokens = min(2.0 * rate, tokens + (now - counted) * rate)
+        tokens = self._tokens(bucket, rate, now)
         allowed = tokens >= 1
         self._buckets[bucket] = (tokens - 1 if allowed else tokens, now)
         if now - self._swept > _SWEEP:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from fastapi import Request
+from typing import Annotated
+
+from fastapi import Header, Request
 
 from orchestrator.control.controller import Controller
 from orchestrator.services.permissions import Actor
 
 IDEMPOTENCY_HEADER = "X-Muster-Idempotency-Key"
 """Makes it safe to repeat a submission whose answer was lost."""
+IdempotencyKey = Annotated[str | None, Header(alias=IDEMPOTENCY_HEADER)]
+"""Parameter of a route that submits a job."""
 
 
 def actor_of(request: Request) -> Actor:

@@ -46,12 +46,12 @@ def parse(pattern: str) -> Matcher:
         plain = re.sub(r"\\(.)", r"\1", phrase, flags=re.DOTALL) if phrase is not None else word
         terms[sign].append(_found_by(regex) if regex is not None else _contains(plain))
         position = match.end()
-    wanted, unwanted, either = terms[""], terms["-"], terms["?"]
+    required, excluded, either = terms[""], terms["-"], terms["?"]
 
     def matches(line: str) -> bool:
         return (
-            all(term(line) for term in wanted)
-            and not any(term(line) for term in unwanted)
+            all(term(line) for term in required)
+            and not any(term(line) for term in excluded)
             and (not either or any(term(line) for term in either))
         )
 
@@ -72,6 +72,6 @@ def _found_by(regex: str) -> Matcher:
     try:
         compiled = re2.compile(regex.encode(), options)
     except re2.error as error:
-        said = error.args[0].decode(errors="replace")
-        raise ValueError(f"regular expression %{regex}%: {said}") from None
+        problem = error.args[0].decode(errors="replace")
+        raise ValueError(f"regular expression %{regex}%: {problem}") from None
     return lambda line: compiled.search(line.encode()) is not None

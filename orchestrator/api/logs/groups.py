@@ -10,7 +10,7 @@ from sqlalchemy import func, select, update
 from sqlalchemy.orm import Session
 
 from orchestrator.api.batch.members import check_log_group
-from orchestrator.api.batch.validation import check_tags
+from orchestrator.api.batch.value_checks import check_tags
 from orchestrator.api.logs.errors import LogsError, absent, invalid, present
 from orchestrator.api.logs.log_events import stored_bytes
 from orchestrator.api.logs.streams import Stream, find_stream, newest_streams
@@ -40,10 +40,10 @@ _STREAM = re.compile(r"[^:*\0]{1,512}")
 
 def named_by(session: Session, request: dict[str, Any]) -> str:
     """Name of the group in ``logGroupName`` or ``logGroupIdentifier``. Raises LogsError where it does not exist."""
-    given = [request[key] for key in ("logGroupName", "logGroupIdentifier") if key in request]
-    if len(given) != 1:
+    named = [request[key] for key in ("logGroupName", "logGroupIdentifier") if key in request]
+    if len(named) != 1:
         raise invalid("Exactly one of logGroupName and logGroupIdentifier is needed.")
-    return existing(session, given[0])
+    return existing(session, named[0])
 
 
 def existing(session: Session, reference: str) -> str:

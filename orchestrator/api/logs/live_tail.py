@@ -1,4 +1,4 @@
-"""The live tail of logs, StartLiveTail: new lines from every stream that is asked for, also from streams that begin later."""
+"""The live tail of logs, StartLiveTail: new lines of the requested streams, also from streams that begin later."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _AGAIN = 1.0
 _REFRESH = 0.25
 """Seconds between two questions to the database about new streams."""
 _OVERLAP = 5000
-"""An attempt that ended this many milliseconds before the last question is asked for again: commits may be late."""
+"""An attempt that ended this many milliseconds before the last query is read again: commits may be late."""
 
 log = logging.getLogger("muster.api")
 
@@ -56,7 +56,7 @@ class _Job:
     """None before it is followed."""
     following: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)
     streams: dict[Key, Stream] = field(default_factory=dict)
-    """Those of its logs that are asked for."""
+    """Those of its logs that belong to the session."""
     newest: dict[Key, int] = field(default_factory=dict)
     """Time of each one's newest event [ms]: times never fall within a stream."""
 
@@ -86,7 +86,7 @@ class LiveTail:
         controller: Controller,
         actor: Actor,
         groups: Collection[str],
-        wanted: Callable[[str], bool],
+        accepts: Callable[[str], bool],
         matches: Matcher,
     ) -> None:
         """Raises OSError.
@@ -95,16 +95,16 @@ class LiveTail:
             controller: Whose jobs' logs are followed.
             actor: Who follows them.
             groups: Names of the log groups.
-            wanted: Whether a stream is asked for, by its name.
-            matches: Whether a line is asked for.
+            accepts: Whether a stream belongs to the session, by its name.
+            matches: Whether a line does.
         """
         self._controller, self._actor, self._groups = controller, actor, groups
-        self._wanted, self._matches = wanted, matches
+        self._accepts, self._matches = accepts, matches
         self.group_of: dict[str, str] = {}
         """Group of each stream that was followed."""
         self.calls, self.waker = controller.access.followed, Waker()
-        self._started = self._asked = now()
-        self._next_refresh, self._is_asked = 0.0, threading.Event()
+        self._started = self._refreshed = now()
+        self._next_refresh, self._is_due = 0.0, threading.Event()
         self._jobs: dict[str, _Job] = {}
         self._over: set[str] = set()
         """Streams that are read to their end and can get no more lines."""
@@ -120,7 +120,7 @@ class LiveTail:
             self._watching.enter_context(self._controller.logs.watch(self))
             for job in self._jobs.values():
                 self._attend(job)
-        self._is_asked.set()  # nobody told of what has changed since the first look
+        self._is_due.set()  # nobody has reported what has changed since the first look
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -132,12 +132,12 @@ class LiveTail:
 
     def wake(self) -> None:
         """Some job has changed: there may be new streams."""
-        self._is_asked.set()
+        self._is_due.set()
         self.waker.wake()
 
     def poll_memory(self) -> list[LogEvent] | None:
         """The events since the last call, in order; None where only the files, or the database, have them."""
-        is_due = self._is_asked.is_set() and time.monotonic() >= self._next_refresh
+        is_due = self._is_due.is_set() and time.monotonic() >= self._next_refresh
         if is_due or any(job.view.in_files for job in self._jobs.values()):
             return None
         events = list[LogEvent]()
@@ -148,7 +148,7 @@ class LiveTail:
 
     def poll(self) -> list[LogEvent]:
         """:meth:`poll_memory` with the files and the database. Raises OSError."""
-        if self._is_asked.is_set():
+        if self._is_due.is_set():
             self._refresh(from_now=False)
         events = list[LogEvent]()
         for job in self._jobs.values():
@@ -167,14 +167,14 @@ class LiveTail:
 
     def _refresh(self, *, from_now: bool) -> None:
         """Take up streams that began; those that ended before this call have their last look."""
-        self._is_asked.clear()
-        asked = now()
+        self._is_due.clear()
+        started = now()
         with self._controller.database.session() as session:
-            since = max(self._started, self._asked - _OVERLAP)
+            since = max(self._started, self._refreshed - _OVERLAP)
             streams = newest_streams(session, self._actor, self._controller.access.store, self._groups, since=since)
-        self._asked, self._next_refresh = asked, time.monotonic() + _REFRESH
+        self._refreshed, self._next_refresh = started, time.monotonic() + _REFRESH
         for stream in streams:
-            if stream.run is not None and stream.name not in self._over and self._wanted(stream.name):
+            if stream.run is not None and stream.name not in self._over and self._accepts(stream.name):
                 job = self._follow(stream.run, stream.job, from_now)
                 job.streams[stream.attempt, stream.node] = stream
                 job.view.in_files = job.view.in_files or job.is_over
@@ -221,7 +221,7 @@ async def messages(
     while not closing.is_set():
         try:
             events, sampled = await _polled(tail)
-        except (OSError, StoreSilent) as error:  # the store is away: it may come back, and nothing is lost
+        except (OSError, StoreSilent) as error:  # the store is unavailable: it may come back, and nothing is lost
             log.warning("live tail: %s", error)
             events, sampled = [], False
             await asyncio.sleep(_AGAIN)

@@ -21,13 +21,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shared_store.volume.files import DamagedFile, open_regular
-from shared_store.volume.log_files import UNKNOWN, LogSegment, left_out, read_log, segments_of
+from shared_store.volume.log_files import LogCursor, LogSegment, left_out, segments_of
 from shared_store.volume.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, LogLine, lines_in
 
 _BLOCK = 32 << 10
 """Bytes between two marks."""
-_READ = 1 << 20
-"""Bytes that are read at once: more than the longest line; supervisors cut at 128 KiB."""
 _BARREN = 64 << 20
 """Bytes without an event that one look reads: a program can make its log a hole of any size."""
 _ENDS = 256 << 10
@@ -104,22 +102,19 @@ class LogFile:
         """End of the head, and the greatest time up to there; None while there is no tail."""
         self._end = 0
         self._top = 0
-        self._identity, self._inside = UNKNOWN, False
+        self._cursor = LogCursor()
         self._begun += 1
 
     def _extend(self, segments: Sequence[LogSegment]) -> bool:
         """Take up the next blocks; False where no whole line is left."""
-        chunk = read_log(segments, self._end, _READ, self._identity, self._inside)
+        chunk = self._cursor.read(segments)
         if chunk.replaced:
             self._forget()
             return True
         if chunk.start and any(segment.start == chunk.start for segment in segments):
             self._tail = self._tail or (self._end, self._top)
             self._mark(chunk.start)
-        self._end, self._identity = chunk.start, chunk.identity
-        whole = chunk.data.rfind(b"\n") + 1
-        self._inside = not whole and len(chunk.data) == _READ
-        whole = len(chunk.data) if self._inside else whole
+        self._end, whole = chunk.start, len(chunk.data)
         start = 0
         while start < whole:
             stop = (chunk.data.find(b"\n", start + _BLOCK - 1, whole) + 1) or whole
@@ -256,7 +251,7 @@ def stored_bytes(path: Path) -> int:
 
 
 def is_event(line: LogLine) -> bool:
-    """Whether CloudWatch Logs shows a line: the supervisor's last one is no output of the job."""
+    """Whether CloudWatch Logs shows a line: the supervisor's last one is not output of the job."""
     return line.rank is not None or line.stream != "o" or _IS_END.match(line.text) is None
 
 

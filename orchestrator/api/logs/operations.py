@@ -16,12 +16,11 @@ from functools import partial
 from itertools import chain, islice
 from typing import Any
 
-from botocore.validate import ParamValidator
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import JSONResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from orchestrator.api.batch.service_model import service_model
+from orchestrator.api.batch.service_model import problem_with, service_model
 from orchestrator.api.http.answer_streams import Following
 from orchestrator.api.http.limits import check_size
 from orchestrator.api.logs import filter as log_filter
@@ -63,7 +62,6 @@ async def answer(
 
     Args:
         controller: Whose logs these are.
-        actor: Who asks.
         ending: Set when the server ends, which ends the streams.
         target: The header ``X-Amz-Target``.
         body: Reads the request's JSON. Raises ClientError.
@@ -106,12 +104,11 @@ def validate(operation: str, request: object) -> dict[str, Any]:
             raise invalid(f"{operation}: zero bytes are not allowed")
     except (UnicodeEncodeError, RecursionError):
         raise invalid(f"{operation}: not text (half a surrogate pair), or nested too deep") from None
-    shape = service_model("logs").operation_model(operation).input_shape
-    report = ParamValidator().validate(request, shape)
-    if report.has_errors():
-        raise invalid(" ".join(report.generate_report().split()))
+    if problem := problem_with("logs", operation, request):
+        raise invalid(problem)
+    members = service_model("logs").operation_model(operation).input_shape.members
     for name, value in request.items():
-        member = shape.members[name]
+        member = members[name]
         size = value if isinstance(value, int) else len(value)
         most = member.metadata.get("max", 2**63 - 1)  # which botocore leaves to the service
         if size > most:
@@ -130,16 +127,16 @@ def get_log_events(controller: Controller, actor: Actor, request: dict[str, Any]
     view = stream.file.look()
     since, before = request.get("startTime", 0), request.get("endTime")
     limit = request.get("limit", _MOST_EVENTS)
-    token = _STREAM_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
-    if given and not token:
+    token = _STREAM_TOKEN.fullmatch(sent) if (sent := request.get("nextToken")) else None
+    if sent and not token:
         raise invalid("The specified nextToken is invalid.")
     forward = token[1] == "f" if token else request.get("startFromHead", False)
     if forward:
         here = int(token[2]) if token else 0
-        told = [view.replaced()] if here > view.end else []
-        here = 0 if told else here
+        notices = [view.replaced()] if here > view.end else []
+        here = 0 if notices else here
         found = _until(view.forward(since, here), lambda event: before is not None and event.time >= before)
-        page = _page(chain(told, found), limit)
+        page = _page(chain(notices, found), limit)
     else:
         here = int(token[2]) if token else view.end
         page = _page(_until(view.backward(before, here), lambda event: event.time < since), limit)[::-1]
@@ -157,8 +154,8 @@ def filter_log_events(controller: Controller, actor: Actor, request: dict[str, A
     """
     newest = now() - SETTLE  # before anything is looked at
     matches = _pattern(request.get("filterPattern", ""))
-    token = _SEARCH_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
-    if given and not token:
+    token = _SEARCH_TOKEN.fullmatch(sent) if (sent := request.get("nextToken")) else None
+    if sent and not token:
         raise invalid("The specified nextToken is invalid.")
     ascending = token[1] == "f" if token else request.get("startFromHead", True)
     since, before = request.get("startTime", 0), request.get("endTime", 10**14) + 1  # inclusive here, as AWS has it
@@ -205,8 +202,8 @@ def describe_log_streams(controller: Controller, actor: Actor, request: dict[str
     prefix = request.get("logStreamNamePrefix", "")
     if by_time and prefix:
         raise invalid("Cannot order by LastEventTime with a logStreamNamePrefix.")
-    token = _LIST_TOKEN.fullmatch(given) if (given := request.get("nextToken")) else None
-    if given and not token:
+    token = _LIST_TOKEN.fullmatch(sent) if (sent := request.get("nextToken")) else None
+    if sent and not token:
         raise invalid("The specified nextToken is invalid.")
     with controller.database.session() as session:
         group = groups.named_by(session, request)
@@ -260,15 +257,15 @@ def start_live_tail(controller: Controller, actor: Actor, ending: threading.Even
     if (names or prefixes) and len(tailed) > 1:
         raise invalid("logStreamNames and logStreamNamePrefixes need exactly one log group in logGroupIdentifiers.")
     matches = _pattern(request.get("logEventFilterPattern", ""))
-    wanted = set(names or ())
+    chosen = set(names or ())
 
-    def asked_for(name: str) -> bool:
-        return name in wanted if names else not prefixes or name.startswith(tuple(prefixes))
+    def accepts(name: str) -> bool:
+        return name in chosen if names else not prefixes or name.startswith(tuple(prefixes))
 
     start = {"logGroupIdentifiers": [log_group_arn(name) for name in tailed]}
     start |= {"logEventFilterPattern": request.get("logEventFilterPattern", "")}
     start |= {"logStreamNames": names or [], "logStreamNamePrefixes": prefixes or []}
-    tail = LiveTail(controller, actor, tailed, asked_for, matches)
+    tail = LiveTail(controller, actor, tailed, accepts, matches)
     return _Session(tail, messages(tail, start, here().id, ending))
 
 

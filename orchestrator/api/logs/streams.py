@@ -78,21 +78,19 @@ def newest_streams(
     """Up to MOST_STREAMS streams of jobs, of the newest jobs that the caller may see.
 
     Args:
-        session: On the database.
-        store: The store that holds the files.
         groups: Names of the log groups.
         prefix: Of the names of the streams; empty for all.
         since: Attempts that ended before this Unix time [ms] are left out.
     """
     in_group = Node.log_group.in_([group for group in groups if group != LOG_GROUP])
-    wanted = [or_(in_group, Node.log_group.is_(None)) if LOG_GROUP in groups else in_group]
+    conditions = [or_(in_group, Node.log_group.is_(None)) if LOG_GROUP in groups else in_group]
     if prefix:  # a whole name begins with the prefix, or the prefix with that of a job's names
         beginning = func.coalesce(Node.log_prefix, Job.name) + "/" + func.replace(Job.id, ":", ".") + "/"
-        given = literal(prefix, String)
-        wanted.append(
+        text = literal(prefix, String)
+        conditions.append(
             or_(
-                func.substr(beginning, 1, len(prefix)) == given,
-                func.substr(given, 1, func.length(beginning)) == beginning,
+                func.substr(beginning, 1, len(prefix)) == text,
+                func.substr(text, 1, func.length(beginning)) == beginning,
             )
         )
     query = (
@@ -104,7 +102,7 @@ def newest_streams(
             load_only(Attempt.created_at, Attempt.stopped_at),
             joinedload(Attempt.nodes).load_only(Node.index, Node.log_group, Node.log_prefix),
         )
-        .where(or_(Attempt.stopped_at.is_(None), Attempt.stopped_at >= since), Attempt.nodes.any(and_(*wanted)))
+        .where(or_(Attempt.stopped_at.is_(None), Attempt.stopped_at >= since), Attempt.nodes.any(and_(*conditions)))
         .order_by(Attempt.stopped_at.is_(None).desc(), Job.created_at.desc(), Job.id, Attempt.number)
         .limit(MOST_STREAMS)
     )

@@ -55,7 +55,7 @@ _FAILED_FIRST = (
 
 
 @dataclass(frozen=True)
-class Wanted:
+class JobSelection:
     """A filter of jobs: by states, by queue, and by a text in their name, id, run or owner. Empty fields mean all."""
 
     statuses: tuple[Status, ...] = ()
@@ -95,14 +95,14 @@ def find_jobs(
             if queue not in (known := queue_names(session, actor)):
                 raise UnknownQueue(queue, known, 404)
     return page_of_jobs(
-        controller, actor, Wanted(tuple(status), queue, search), most, after, before, with_progress=progress
+        controller, actor, JobSelection(tuple(status), queue, search), most, after, before, with_progress=progress
     )
 
 
 def page_of_jobs(
     controller: Controller,
     actor: Actor,
-    wanted: Wanted,
+    selection: JobSelection,
     most: int = JOBS_A_PAGE,
     after: str = "",
     before: str = "",
@@ -118,17 +118,17 @@ def page_of_jobs(
     if after and before:
         raise RequestError("a page is after a place or before one, not both; leave one of them out")
     places = {"after": Cursor.read(after) if after else None, "before": Cursor.read(before) if before else None}
-    queues = wanted.queues(actor)
+    queues = selection.queues(actor)
     with controller.database.session() as session:
-        if conditions := wanted.conditions(session):
+        if conditions := selection.conditions(session):
             counts = count(session, queues, conditions, MOST_COUNTED)
         else:
             counts = controller.database.counts.by_status(queues)
-        page = read_page(session, most, queues, wanted.statuses, conditions, **places)
+        page = read_page(session, most, queues, selection.statuses, conditions, **places)
         rows = [_row(controller, session, job) for job in page.jobs]
     trainings = [training for _, training in rows if training is not None and with_progress]
     progress = _progress(controller, actor, trainings)
-    states = wanted.statuses or tuple(Status)
+    states = selection.statuses or tuple(Status)
     return {
         "jobs": [{**row, "progress": progress.get(row["id"]), "isOwn": row["owner"] == actor.name} for row, _ in rows],
         "total": sum(counts.get(each, 0) for each in states),
@@ -139,11 +139,11 @@ def page_of_jobs(
     }
 
 
-def ids_of(session: Session, actor: Actor, wanted: Wanted) -> list[str]:
+def ids_of(session: Session, actor: Actor, selection: JobSelection) -> list[str]:
     """The ids of all jobs that are wanted and not over."""
-    active = [each for each in wanted.statuses or tuple(Status) if not each.is_terminal]
-    query = select(Job.id).where(Job.parent.is_(None), *wanted.conditions(session), Job.status.in_(active))
-    if (queues := wanted.queues(actor)) is not None:
+    active = [each for each in selection.statuses or tuple(Status) if not each.is_terminal]
+    query = select(Job.id).where(Job.parent.is_(None), *selection.conditions(session), Job.status.in_(active))
+    if (queues := selection.queues(actor)) is not None:
         query = query.where(Job.queue.in_(queues))
     return list(session.scalars(query.order_by(Job.created_at, Job.id)))
 

@@ -32,9 +32,9 @@ _HEARTBEAT = 5.0
 def positions_of(text: str) -> dict[str, int]:
     """Raises ClientError."""
     try:
-        given = json.loads(text)
-        if all(isinstance(position, int) and 0 <= position < 2**63 for position in given.values()):
-            return dict(given)
+        positions = json.loads(text)
+        if all(isinstance(position, int) and 0 <= position < 2**63 for position in positions.values()):
+            return dict(positions)
     except (ValueError, AttributeError, RecursionError):
         pass
     raise ClientError('positions: expected a JSON object such as {"1/0": 4096}')

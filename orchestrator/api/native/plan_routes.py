@@ -22,12 +22,11 @@ from orchestrator.engines.api import EngineError, Gang, Plan
 from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Attempt, ComputeEnvironment, Job
 from orchestrator.scheduling.placement import needs
+from orchestrator.services.chosen_checkpoints import check_evaluation, check_task, check_training
 from orchestrator.services.context import permitted_run
-from orchestrator.services.evaluated_checkpoints import check_evaluation, check_task
 from orchestrator.services.fit import fit_of, named_queue
 from orchestrator.services.permissions import JobsOf, Operation
 from orchestrator.services.sources import sources_of
-from orchestrator.services.stored_names import check_training
 from shared_store.contract import plugins
 
 router = APIRouter(route_class=StoreRoute)
@@ -47,22 +46,22 @@ class PlanRequest(BaseModel):
 def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
     """The processes that a job would start, and their hosts, if all hosts were free. Nothing is registered and nothing starts."""
     controller, actor = controller_of(request), actor_of(request)
-    wanted, definition = _gang_of(body), body.definition
-    check_training(controller.access.store, wanted.spec)
-    for source in sources_of(wanted):
+    requested, definition = _gang_of(body), body.definition
+    check_training(controller.access.store, requested.spec)
+    for source in sources_of(requested):
         run = permitted_run(controller, actor, source.run, Operation.READ_RUN)
         if not source.is_teacher:
             check_task(run)
         if source.key in plugins.evaluating():
-            check_evaluation(controller.access.store, run, wanted.spec or {}, source.key)
+            check_evaluation(controller.access.store, run, requested.spec or {}, source.key)
     controller.engines.capacity(patience=FRESH)  # before the transaction, which must not wait for an engine
     with controller.database.session() as session:
         queue = named_queue(session, actor, body.queue)
         actor.check(Operation.PLAN, JobsOf(queue.name))
-        found = fit_of(session, actor, controller, queue, wanted)
+        found = fit_of(session, actor, controller, queue, requested)
         if found.allocation is None:
             raise ClientError(
-                found.problem or f"{needs(wanted.shape)}; no host that it could have is known now; more may come"
+                found.problem or f"{needs(requested.shape)}; no matching host is registered; the engine may add hosts"
             )
         compute_environment, placements = found.allocation
         job = Job(
@@ -70,19 +69,19 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
             name=definition["jobDefinitionName"],
             queue=queue.name,
             kind="multinode",
-            run=wanted.options.run or "run",
+            run=requested.options.run or "run",
             timeout=(definition.get("timeout") or {}).get("attemptDurationSeconds"),
             priority=definition.get("schedulingPriority", 0),
         )
         attempt = Attempt(number=1, epoch=1, compute_environment=compute_environment, nodes=new_nodes(placements))
         options = options_of(session.get(ComputeEnvironment, compute_environment), queue)
-        gang = controller.attempts.gang(job, attempt, wanted, options)  # neither of the two is stored
+        gang = controller.attempts.gang(job, attempt, requested, options)  # neither of the two is stored
     planned = _planned(controller, replace(gang, bus_token="…") if gang.bus_token else gang)
     nodes = [
         {
             "index": node.contract.node_index,
             "rank": node.contract.node_rank,
-            "image": wanted.nodes[node.contract.node_index].container.get("image"),
+            "image": requested.nodes[node.contract.node_index].container.get("image"),
             **asdict(node.placement),
             "address": node.contract.address,
             "command": list(node.command),
@@ -111,13 +110,13 @@ def plan(request: Request, body: PlanRequest) -> dict[str, Any]:
 def fits(request: Request, body: PlanRequest) -> dict[str, Any]:
     """Why the job could never start in the queue, whatever else ended; ``problem`` is null where it could."""
     controller, actor = controller_of(request), actor_of(request)
-    wanted = _gang_of(body)
-    check_training(controller.access.store, wanted.spec)
+    requested = _gang_of(body)
+    check_training(controller.access.store, requested.spec)
     controller.engines.capacity(patience=FRESH)
     with controller.database.session() as session:
         queue = named_queue(session, actor, body.queue)
         actor.check(Operation.FIT, JobsOf(queue.name))
-        return {"problem": fit_of(session, actor, controller, queue, wanted).problem}
+        return {"problem": fit_of(session, actor, controller, queue, requested).problem}
 
 
 def _gang_of(body: PlanRequest) -> GangSpec:

@@ -24,7 +24,6 @@ from orchestrator.api.native import (
     retention_routes,
     run_routes,
     submit_routes,
-    text_routes,
     webhook_routes,
 )
 from orchestrator.api.native.log_stream import followed, positions_of, stored
@@ -56,7 +55,7 @@ router.include_router(job_list.router)
 router.include_router(queue_overview.router)
 router.include_router(run_routes.router)
 router.include_router(retention_routes.router)
-router.include_router(text_routes.router)
+router.include_router(submit_routes.texts)
 router.include_router(model_routes.router)
 router.include_router(webhook_routes.router)
 router.include_router(key_routes.router)
@@ -82,7 +81,7 @@ def _jobs_of_run(session: Session, actor: Actor, reference: str) -> str:
         return ""
     names = ", ".join(named(job.name, job.id) for job in made[-5:])
     which = "job" if len(made) == 1 else "jobs"
-    return f"{reference} is a run, which {which} {names} made; see: muster show {short_id(made[-1].id)}"
+    return f"{reference} is a run (created by {which} {names}); try: muster show {short_id(made[-1].id)}"
 
 
 @router.get("/capacity")
@@ -223,7 +222,7 @@ def job_logs(
             count = len(job.gang.nodes)
         if node is not None and not 0 <= node < count:
             raise ClientError(
-                f"job {named(job.name, job.id)} has nodes 0 to {count - 1}, none is {str(node)[:20]}", 404
+                f"job {named(job.name, job.id)} has no node {str(node)[:20]}: it is out of range (0-{count - 1})", 404
             )
         chosen = Chosen(controller.access.store.run(job.run), job.id, node, rank, attempt)
     view, calls = LogView(chosen, positions_of(positions), PIECE), controller.access.followed

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 from pydantic import BaseModel, Field
 
-from orchestrator.api.http.requests import IDEMPOTENCY_HEADER, actor_of, controller_of
+from orchestrator.api.http.requests import IdempotencyKey, actor_of, controller_of
 from orchestrator.api.http.store_route import StoreRoute
 from orchestrator.services import clone as clones
-from orchestrator.services import lineage, runs
+from orchestrator.services import runs
 from orchestrator.services.context import permitted_run
 from orchestrator.services.permissions import Operation
 from orchestrator.services.resume import resume
@@ -68,8 +68,8 @@ def list_runs(
     controller, actor = controller_of(request), actor_of(request)
     found = runs.list_runs(controller, actor, after, most, search, archived)
     if len(found) == most:
-        asked = {**({"search": search} if search else {}), **({"archived": "true"} if archived else {})}
-        query = urlencode({"max": most, "after": found[-1]["run"], **asked})
+        filters = {**({"search": search} if search else {}), **({"archived": "true"} if archived else {})}
+        query = urlencode({"max": most, "after": found[-1]["run"], **filters})
         response.headers["Link"] = f'</api/runs?{query}>; rel="next"'
     return actor.shown(found)
 
@@ -80,7 +80,7 @@ def run_detail(request: Request, name: str) -> Any:
     controller, actor = controller_of(request), actor_of(request)
     run = permitted_run(controller, actor, name, Operation.READ_RUN)
     described = runs.describe_run(controller, actor, run)
-    return actor.shown({**described, "clones": lineage.clones_of(controller, actor, run)})
+    return actor.shown({**described, "clones": runs.clones_of(controller, actor, run)})
 
 
 @router.get("/runs/{name}/checkpoints")
@@ -102,8 +102,8 @@ def _evaluated(summary: dict[str, Any] | None) -> dict[str, Any] | None:
     """The result of a checkpoint in the worlds of its training: ``mean``, ``low``, ``high`` of the return, ``episodes``."""
     if summary is None:
         return None
-    told = summary.get("return")
-    interval = told if isinstance(told, dict) else {}
+    returned = summary.get("return")
+    interval = returned if isinstance(returned, dict) else {}
     ends = {end: interval.get(end) for end in ("low", "high")}
     return {"mean": summary["mean_return"], **ends, "episodes": summary["episodes"], "name": summary["name"]}
 
@@ -133,10 +133,7 @@ def run_metrics(
 
 @router.post("/runs/{name}/resume")
 def resume_run(
-    request: Request,
-    name: str,
-    body: ResumeRequest,
-    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
+    request: Request, name: str, body: ResumeRequest, idempotency_key: IdempotencyKey = None
 ) -> dict[str, Any]:
     """Submit a job that continues the run; a second call with the same idempotency key gets the answer of the first one."""
     controller, actor = controller_of(request), actor_of(request)
@@ -146,10 +143,7 @@ def resume_run(
 
 @router.post("/runs/{name}/clone")
 def clone_run(
-    request: Request,
-    name: str,
-    body: CloneRequest,
-    idempotency_key: str | None = Header(default=None, alias=IDEMPOTENCY_HEADER),
+    request: Request, name: str, body: CloneRequest, idempotency_key: IdempotencyKey = None
 ) -> dict[str, Any]:
     """Submit a job that begins a new run with the weights of this one; a second call with the same idempotency key gets the answer of the first one."""
     controller, actor = controller_of(request), actor_of(request)

@@ -303,7 +303,12 @@ def test_a_definition_of_another_key_is_used_only_where_its_tag_names_the_queue(
     tags, bearer = {"muster:queues": "other lab"}, {"Authorization": f"Bearer {TOKEN}"}
     httpx.post(f"{world.url}/v1/tags/{arn}", json={"tags": tags}, headers=bearer).raise_for_status()
     lab.batch("SubmitJob", **request)
-    refused("key robots may use", world.clients["robots"].batch, "SubmitJob", **{**request, "jobQueue": "robots"})
+    refused(
+        "key robots is not authorized for SubmitJob",
+        world.clients["robots"].batch,
+        "SubmitJob",
+        **{**request, "jobQueue": "robots"},
+    )
     assert SECRET in json.dumps(lab.batch("DescribeJobDefinitions", jobDefinitionName="common"))
     assert admin.batch("DescribeJobDefinitions", jobDefinitionName="common")["jobDefinitions"][0]["revision"] == 1
 

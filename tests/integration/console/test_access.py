@@ -240,8 +240,8 @@ def test_a_key_is_deleted_once_the_person_has_said_yes(console: Console) -> None
 
 def test_only_keys_with_all_queues_see_keys_and_a_read_only_one_changes_none(console: Console) -> None:
     lab, reader = console.visitor("lab"), console.visitor("reader")
-    assert "may use job queue lab only" in lab.page("/keys", 403).text
-    for visitor, said in ((lab, "may use job queue lab only"), (reader, "is read-only")):
+    assert "limited to job queue lab" in lab.page("/keys", 403).text
+    for visitor, said in ((lab, "limited to job queue lab"), (reader, "is read-only")):
         made = visitor.submit("/keys/create", name="mine")
         gone = visitor.submit("/keys/delete", name="admin", confirmed="yes")
         for answer in (made, gone):

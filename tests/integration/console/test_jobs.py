@@ -156,7 +156,7 @@ def test_all_that_the_filter_finds_is_stopped_also_beyond_the_page(console: Cons
     question = visitor.submit("/jobs/stop", all="yes", search="job-1")
     assert question.json()["question"]["title"] == "Stop 30 jobs?"
     lab = console.visitor("lab")
-    assert "may use job queue lab only" in lab.refusal("/jobs/stop", job=[many[5]], confirmed="yes")
+    assert "limited to job queue lab" in lab.refusal("/jobs/stop", job=[many[5]], confirmed="yes")
     assert visitor.submit("/jobs/stop", all="yes", search="job-", confirmed="yes").status_code == 200
     done = wait_for(lambda: not names(visitor.page("/?state=waiting&search=job-")), 60, "the end of all")
     assert done and console.client.get("/api/jobs", status="FAILED", search="job-")["total"] == 120

@@ -161,7 +161,7 @@ def test_a_read_only_key_and_a_key_of_another_queue_submit_nothing(console: Cons
     for path in ("/submit", "/submit/check", "/submit/review", "/submit/yaml", "/submit/task/Ant"):
         assert "is read-only" in reader.refusal(path, yaml=COMMAND), path
     lab = console.visitor("lab")
-    assert "may use job queue lab only" in lab.refusal("/submit", yaml=COMMAND.replace("queue: lab", "queue: default"))
+    assert "limited to job queue lab" in lab.refusal("/submit", yaml=COMMAND.replace("queue: lab", "queue: default"))
     token = lab.page("/").form_token
     stolen = lab.http.post("/submit", data={"form_token": token[:-1] + "x", "yaml": COMMAND})
     assert stolen.status_code == 403 and "reload the page" in stolen.text

@@ -178,7 +178,7 @@ def test_facts_of_a_deleted_run_are_not_shown_for_a_new_run_of_the_same_name(con
 def test_showing_a_run_names_the_jobs_that_made_it(controller: Controller) -> None:
     job = submit_gang(controller.client, "pass", name="short")
     refused = controller.muster("show", f"short-{job[:8]}")
-    line = f"muster: short-{job[:8]} is a run, which job short ({job[:8]}) made; see: muster show {job[:8]}\n"
+    line = f"muster: short-{job[:8]} is a run (created by job short ({job[:8]})); try: muster show {job[:8]}\n"
     assert (refused.returncode, refused.stderr) == (2, line)
 
 

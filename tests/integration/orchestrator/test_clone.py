@@ -116,8 +116,8 @@ REFUSED = {
     "altered": r"checkpoint 00000004-e1: the content of learner\.pt was altered.*another \(2\)",
     "missing": r"checkpoint 00000002-e1: learner\.pt is missing; choose another \(there is none\)",
     "newer": f"has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster",
-    "taught --set train.ppo.hidden_sizes=[9]": r"train\.ppo\.hidden_sizes \[8\] and does not fit \[9\]",
-    "taught --set train.ppo.activation=relu": r"train\.ppo\.activation 'elu' and does not fit 'relu'",
+    "taught --set train.ppo.hidden_sizes=[9]": r"train\.ppo\.hidden_sizes \[8\], which can't become \[9\]",
+    "taught --set train.ppo.activation=relu": r"train\.ppo\.activation 'elu', which can't become 'relu'",
     "taught --set train.algorithm=sac --set train.ppo={}": (
         r"has weights of algorithm ppo, which sac can't read.*train\.algorithm=ppo, or with a module:Class"
     ),

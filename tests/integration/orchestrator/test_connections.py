@@ -79,7 +79,7 @@ def test_half_open_connections_keep_no_job_from_starting_and_cut_no_follower(tmp
         assert all({"first", "last"} <= set(lines) for lines in seen), "a follower was cut"
         assert server.wait(followed)["status"] == "SUCCEEDED"
         log = server.errors.read_text()
-        assert "have waited longest for their client are closed" in log
+        assert "have waited for their client longest are closed first" in log
         assert len(log.splitlines()) < 10 and "Traceback" not in log, log[:2000]
 
 

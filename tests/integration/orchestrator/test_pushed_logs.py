@@ -16,6 +16,7 @@ from orchestrator.control import bus as bus_module
 from orchestrator.control import log_tail
 from orchestrator.server import Server
 from shared_store.contract.bus import Node
+from shared_store.volume import log_files
 from tests.conftest import submit_gang, wait_for
 
 SAYS = """
@@ -91,9 +92,8 @@ def test_lines_come_by_push_alone_while_the_bus_delivers(talk: Talk, monkeypatch
     wait_for(lambda: all(map(talk.has_all, everyone)) and talk.is_pushed())
     looks: list[Any] = []
     genuine: Callable[..., Any] = log_tail.read_log
-    for module in (log_tail, "shared_store.volume.log_view"):
-        name = f"{module}.read_log" if isinstance(module, str) else f"{module.__name__}.read_log"
-        monkeypatch.setattr(name, lambda *given: (looks.append(given), genuine(*given))[1])
+    for module in (log_tail, log_files):
+        monkeypatch.setattr(module, "read_log", lambda *given: (looks.append(given), genuine(*given))[1])
     monkeypatch.setattr(log_tail, "FRESH", 3600.0)  # the machine may be busy for longer than the node's word counts
     for number in range(30):
         talk.say(f"line {number}")

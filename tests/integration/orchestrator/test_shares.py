@@ -125,7 +125,7 @@ def test_a_job_that_comes_from_anothers_run_has_the_share_of_the_one_who_submits
     for name, share in (("key bob", "lab"), ("key ann-1", "ann1"), ("MUSTER_TOKEN", "ann1")):
         actor = server.access.actor_named(name)
         assert actor is not None
-        job = derived_jobs.evaluate(server.controller, actor, store.run("taught"), {"episodes": 1}, "")
+        job = derived_jobs.derive(server.controller, actor, store.run("taught"), "evaluate", {"episodes": 1}, "")
         assert lab.share_of(job.id) == share, name
     exported = {"resources": {"cpus": 1}, "command": None, "export": {"run": "taught"}}
     found = {who: lab.spec(who, **exported) for who in ("bob", "ann-1", "token")}

@@ -198,10 +198,10 @@ def test_gangs_of_a_deleted_database_are_named_at_the_next_start(home: Path, cap
         path.unlink()
     with serving(home) as client:
         [line] = [record.getMessage() for record in caplog.records if "has no such job" in record.getMessage()]
-        assert line.startswith(f"gang {known}/1/1 runs on this machine") and "end it with: kill " in line
+        assert line.startswith(f"orphaned gang {known}/1/1 runs on this machine") and "terminate it with: kill " in line
         other = submit_gang(client, FOREVER)
         await_status(client, other, "RUNNING")
-    for pid in line.partition("end it with: kill ")[2].split():
+    for pid in line.partition("terminate it with: kill ")[2].split():
         os.kill(int(pid), signal.SIGTERM)
     wait_for(lambda: not processes_of_job(known), 30, "its end")
     with serving(home) as client:

@@ -20,7 +20,7 @@ from orchestrator.control.store_calls import StoreCalls
 from orchestrator.domain.job import Status
 from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
-from shared_store.volume import log_view
+from shared_store.volume import log_files, log_view
 from shared_store.volume.layout import Run
 from shared_store.volume.log_files import Chunk, LogWriter, read_log
 from shared_store.volume.log_view import LogView
@@ -139,7 +139,7 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
         return read
 
     monkeypatch.setattr(log_tail, "read_log", counted("hub"))
-    monkeypatch.setattr(log_view, "read_log", counted("followers"))
+    monkeypatch.setattr(log_files, "read_log", counted("followers"))
     return found
 
 

@@ -89,7 +89,7 @@ def no_look(*_: object) -> None:
 def test_what_is_pushed_is_read_without_a_look_at_a_file(job: Followed, monkeypatch: pytest.MonkeyPatch) -> None:
     job.state()
     monkeypatch.setattr(log_tail, "read_log", no_look)
-    monkeypatch.setattr("shared_store.volume.log_view.read_log", no_look)
+    monkeypatch.setattr("shared_store.volume.log_files.read_log", no_look)
     for number in range(100):
         job.write(f"line {number}")
         assert not job.state() and job.logs.delivers()

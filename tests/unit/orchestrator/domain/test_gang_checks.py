@@ -7,8 +7,9 @@ import json
 import pytest
 
 from orchestrator.domain.errors import ClientError
-from orchestrator.domain.gang import DEEPEST_SPEC, gang_needs
+from orchestrator.domain.gang import gang_needs
 from orchestrator.domain.gang_checks import LARGEST_ENVIRONMENT, MOST_VARIABLES, checked_gang
+from orchestrator.domain.storable import DEEPEST_SPEC
 from shared_store.contract.node import LEAST_LOG_LIMIT
 from tests.support.definitions import container, nodes_of
 from tests.support.refusals import refusal

@@ -66,7 +66,7 @@ def test_the_last_checkpoint_is_left_to_the_training_itself_and_a_later_epoch_is
 
 
 def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_nothing_else() -> None:
-    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", EVALUATION), EVALUATION, 40)
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", EVALUATION, "a"), EVALUATION, 40)
     assert spec.evaluate is not None and spec.evaluate.model_dump(exclude_none=True) == {
         **{"run": "ant-1", "checkpoint": 40, "episodes": 32, "worlds": 16, "config": {}, "keep": False}
     }
@@ -76,7 +76,7 @@ def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_
     section = {"every": 1, "queue": "idle", "resources": {"cpus": 0.5, "memory": 512}, "retry": {"attempts": 1}}
     expected = wanted_of({**TRAINED, "evaluation": section})
     assert expected is not None
-    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", "a", expected), expected, 40)
+    spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", expected, "a"), expected, 40)
     assert (spec.queue, spec.share, spec.resources.cpus, spec.resources.memory) == ("idle", None, 0.5, 512)
     assert (spec.resources.gpus, spec.retry.attempts) == (0, 1)
 
@@ -84,7 +84,7 @@ def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_
 def test_the_evaluations_of_a_training_that_accepts_a_changed_robot_accept_it_too() -> None:
     accepting = {**TRAINED, "train": {**TRAINED["train"], "accept_changed_robot": True}}
     for trained, accepts in ((TRAINED, False), (accepting, True)):
-        spec = automatic_evaluation("ant-1", trained, place_of("slow", "a", EVALUATION), EVALUATION, 40)
+        spec = automatic_evaluation("ant-1", trained, place_of("slow", EVALUATION, "a"), EVALUATION, 40)
         assert spec.evaluate is not None and spec.evaluate.accept_changed_robot is accepts
 
 

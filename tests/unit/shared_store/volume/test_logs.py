@@ -201,7 +201,7 @@ def test_a_window_of_long_logs_reads_little_of_each(tmp_path: Path, monkeypatch:
         read.append(len(chunk.data))
         return chunk
 
-    monkeypatch.setattr("shared_store.volume.log_view.read_log", counted)
+    monkeypatch.setattr("shared_store.volume.log_files.read_log", counted)
     window = lines_after(Chosen(run, "job"), {}, 100)
     assert len(window.lines) == 100 and window.more and sum(read) <= nodes * 64 << 10
 

@@ -6,9 +6,10 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
-from orchestrator.domain.gang import DEEPEST_SPEC
 from shared_store.contract.error_text import kind_of, shown
 
+DEEPEST_SPEC = 100
+"""Levels of lists and mappings in a spec. A deeper one could be stored, but no answer could show it."""
 Problem = tuple[tuple[str | int, ...], str]
 """Keys to a value of a document, and what is wrong with it in one line."""
 
