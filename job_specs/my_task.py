@@ -9,12 +9,12 @@ import warp as wp
 from worker.tasks import (
     Action,
     Declaration,
-    DeclaredTask,
     Event,
     Observation,
     Reward,
     Robot,
     RobotArrays,
+    Task,
     TaskConfig,
     WorldArrays,
     reward_weights,
@@ -45,7 +45,7 @@ def pointing(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, ta
     return wp.cos(worlds.joint_q[world, robot.coordinates[joint]] - target)
 
 
-class Pendulum(DeclaredTask):
+class Pendulum(Task):
     """A pendulum that hangs down and a motor that must swing it up: 3 observations, 1 action."""
 
     config_type = PendulumConfig

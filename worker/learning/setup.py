@@ -27,7 +27,7 @@ from worker.settings.errors import UserError
 from worker.simulation.robot_values import shown_value
 from worker.tasks.run.adapting import begin_evaluation
 from worker.tasks.run.mistakes import task_mistakes
-from worker.tasks.run.policy_contract import policy_contract, readings_of, robots_of, same_policy
+from worker.tasks.run.policy_contract import policy_contract, robots_of, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -221,7 +221,7 @@ def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) ->
     else:
         changed = {
             name: [each for each in reading.corrected if not each.is_rounding]
-            for name, reading in readings_of(task).items()
+            for name, reading in task.readings.items()
         }
         lines = [f"{name}: {_before(differences)}" for name, differences in changed.items() if differences]
     if not lines:

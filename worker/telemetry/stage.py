@@ -21,7 +21,7 @@ from worker.simulation.carriers import is_carrier
 from worker.simulation.on_host import numbers
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 if TYPE_CHECKING:
     from worker.settings.task import TaskConfig
@@ -148,7 +148,7 @@ class Stage:
 
 def _seen(task_type: type[Task]) -> type[Task]:
     """The task, with the geoms of its robots that are only seen."""
-    if not issubclass(task_type, DeclaredTask):
+    if not issubclass(task_type, Task):
         return task_type
 
     def robot(self: Any, config: Any) -> Any:
@@ -162,7 +162,7 @@ def _seen(task_type: type[Task]) -> type[Task]:
 
 def _robot_file(sketch: Task, config: TaskConfig) -> tuple[str, str] | None:
     """Name and text of the robot's file; None where it is binary, or the task has no such file."""
-    file = getattr(sketch.robot(config), "file", None) if isinstance(sketch, DeclaredTask) else None
+    file = getattr(sketch.robot(config), "file", None) if isinstance(sketch, Task) else None
     if file is None:
         return None
     found = robot_files.read(file)

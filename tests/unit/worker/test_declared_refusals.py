@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import warp as wp
 
-from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from tests.support.refusals import refusal
 from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, far_away, kick, target
 from worker.simulation.declared_randomization import Randomize
@@ -267,11 +266,3 @@ def test_a_robots_file_that_is_not_text_is_named(tmp_path: Path, name: str) -> N
         ValueError, match=rf"{name}: the file is not text in UTF-8 \(invalid start byte at byte 128\); declare its enc"
     ):
         Unreadable.sketch(SlidersConfig())
-
-
-def test_a_task_of_kernels_has_no_numbers_for_a_curriculum() -> None:
-    config = PendulumConfig(curriculum={"events.push.speed": ((0, 1.0),)})
-    with pytest.raises(
-        ValueError, match=r"^task PendulumByHand: curriculum: it has no number events.push.speed; declared"
-    ):
-        PendulumByHand(config, 1)

@@ -158,13 +158,13 @@ def test_an_infinite_end_of_a_range_is_refused_by_a_rank_too() -> None:
 
 
 TASK = """import warp as wp
-from worker.tasks import DeclaredTask, TaskConfig, WorldArrays, Declaration, Action, Observation, Reward, Robot, terms
+from worker.tasks import Task, TaskConfig, WorldArrays, Declaration, Action, Observation, Reward, Robot, terms
 
 @wp.func
 def typo(world: int, worlds: WorldArrays) -> float:
     return worlds.joint_qq[world, 0]
 
-class Bad(DeclaredTask):
+class Bad(Task):
     config_type = TaskConfig
     def robot(self, config):
         {robot}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
@@ -25,6 +26,9 @@ from worker.tasks.declare.functions import (
 )
 from worker.tasks.declare.term_needs import Needs, needs_of
 
+_PLURALS = {"joint": "joints", "body": "bodies", "site": "sites"}
+"""The option of a term that selects elements of a kind."""
+
 
 @dataclass
 class Bound:
@@ -39,6 +43,7 @@ class Bound:
         arguments: Its parameters as expressions of the kernel; the others (``world``, elements) are variables of the kernel.
         memory: First column of its own memory, -1 without any.
         external: First column of a torch term's result, -1 for a Warp function.
+        chosen: The elements that a torch function takes, by parameter: ``joints``, ``bodies`` or ``sites``.
         width: Numbers of one result.
     """
 
@@ -50,6 +55,7 @@ class Bound:
     arguments: dict[str, str] = field(default_factory=dict)
     memory: int = -1
     external: int = -1
+    chosen: dict[str, list[int]] = field(default_factory=dict)
     width: int = 1
 
     @property
@@ -84,7 +90,6 @@ class Binder:
         hidden: Count of the hidden numbers of each command, which follow those.
         memory: Number of allocated columns of ``episodes.memory``.
         lasting: Number of allocated columns of ``episodes.lasting``.
-        external: Columns of torch terms.
         indices: Elements that are not a range of whole numbers, one selection after the other.
     """
 
@@ -99,7 +104,6 @@ class Binder:
         self.indices: list[int] = []
         self.memory = 0
         self.lasting = 0
-        self.external = 0
 
     def bind(self, place: str, term: Term, *, element: bool = True, own: Mapping[str, str] | None = None) -> Bound:
         """Bind a term.
@@ -145,8 +149,18 @@ class Binder:
     def _bind_torch(self, place: str, term: Term) -> Bound:
         if not callable(term.function):
             raise ValueError(f"{place}: {shown(term.function)} is no function; {_function_instead(term.function)}")
-        bound = Bound(place, term, None, width=term.size or 1, external=self.external)
-        self.external += bound.width
+        bound = Bound(place, term, None, width=term.size or 1)
+        found = inspect.signature(term.function)
+        for element, name in _PLURALS.items():
+            if name in found.parameters and name not in term.parameters:
+                view = self._view(place, term.robot)
+                bound.chosen[name], _ = find(place, view, element, getattr(term, name))
+            elif getattr(term, name) not in (None, "*"):
+                raise ValueError(f"{place}: {term.function_name} has no parameter {name}; leave {name}= out")
+        try:
+            found.bind("the task", **term.parameters, **bound.chosen)
+        except TypeError as error:
+            raise ValueError(f"{place}: {term.function_name}: {error}") from error
         return bound
 
     def _indices(self, place: str, term: Term, found: Signature, given: Mapping[str, Any]) -> list[str]:
@@ -250,9 +264,7 @@ class Binder:
                 )
             return list(range(len(self.actions))), list(self.actions)
         view = self._view(place, term.robot)
-        return find(
-            place, view, element, getattr(term, {"joint": "joints", "body": "bodies", "site": "sites"}[element])
-        )
+        return find(place, view, element, getattr(term, _PLURALS[element]))
 
     def _view(self, place: str, name: str) -> RobotView:
         if name not in self.views:
@@ -376,7 +388,7 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
         ValueError: None fits, or none was named.
     """
     if pattern is None:
-        plural = {"body": "bodies"}.get(element, f"{element}s")
+        plural = _PLURALS[element]
         raise ValueError(f"{place}: say which {plural} it is for, with {plural}=")
     try:
         if element == "joint":

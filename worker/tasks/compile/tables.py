@@ -153,13 +153,16 @@ def _joints(plan: KernelPlan, bound: Bound) -> list[str]:
 
 def _observation(plan: KernelPlan, seen: Seen) -> Row:
     count = len(seen.names)
-    noise = _spread(value_of(plan, seen.noise, index, 0.0) for index in range(count)) if seen.noise else ""
+    noises = [
+        f"{'normal' if noise.normal else 'uniform'} {_spread(value_of(plan, noise.amounts, i, 0.0) for i in range(count))}"
+        for noise in seen.noises
+    ]
     clip = [plan.numbers.values[seen.clip], plan.numbers.values[seen.clip + 1]] if seen.clip is not None else None
     least, greatest = seen.term.delay
     return _term(plan, seen.bound) | {
         "columns": str(seen.size),
         "scale": _spread(value_of(plan, seen.scale, index, 1.0) for index in range(count)) if seen.scale else "",
-        "noise": f"{'normal' if seen.normal else 'uniform'} {noise}" if noise else "",
+        "noise": ", ".join(noises),
         "clip": _vector(clip) if clip else "",
         "delay": f"{least} to {greatest}" if greatest else "",
         "history": str(seen.term.history) if seen.term.history > 1 else "",
@@ -169,9 +172,8 @@ def _observation(plan: KernelPlan, seen: Seen) -> Row:
 def _reward(plan: KernelPlan, bound: Bound) -> Row:
     term = bound.term
     assert isinstance(term, Reward)
-    weight = plan.config.rewards[bound.name]
     return (
-        {"name": bound.name, "weight": f"{weight:g}"}
+        {"name": bound.name, "weight": f"{plan.weights[bound.name]:g}"}
         | _term(plan, bound)
         | {"per": "second" if term.per_second else "step"}
     )

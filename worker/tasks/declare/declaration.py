@@ -23,7 +23,8 @@ class Term:
     """A function, the elements that it is applied to, and its numbers.
 
     Args:
-        function: A ``@wp.func``; or a Python function ``(task, **parameters) -> torch.Tensor``, whose launches are captured.
+        function: A ``@wp.func``; or a Python function ``(task, **parameters) -> torch.Tensor``, whose launches are captured. A parameter
+            ``joints``, ``bodies`` or ``sites`` of such a function gets the indices of what the term selects, as a tensor.
         robot: Name of the robot or object to which ``RobotArrays`` and patterns refer.
         joints: The joints, for a function with a parameter ``joint``.
         bodies: The bodies, for a function with a parameter ``body``.
@@ -64,19 +65,27 @@ class Term:
 
 
 class Reward(Term):
-    """A term of the reward, a float, summed over its elements; its weight is in ``config.rewards`` under its name.
+    """A term of the reward, a float, summed over its elements.
 
     Args:
         function: As for :class:`Term`.
+        weight: Its factor, negative for a cost; a number of the same name in ``config.rewards`` takes its place.
         per_second: Multiply by the length of the control step [s].
         unless_terminated: The term is 0 in a step in which a termination ends the episode.
         **options: As for :class:`Term`.
     """
 
     def __init__(
-        self, function: Any, *, per_second: bool = False, unless_terminated: bool = False, **options: Any
+        self,
+        function: Any,
+        *,
+        weight: float | None = None,
+        per_second: bool = False,
+        unless_terminated: bool = False,
+        **options: Any,
     ) -> None:
         super().__init__(function, **options)
+        self.weight = weight
         self.per_second, self.unless_terminated = per_second, unless_terminated
 
 
@@ -345,7 +354,7 @@ class Declaration:
     Without a group ``critic``, the critic sees the policy's observations without noise and delay. An :class:`Image` group must also be
     named in the configuration's ``further_groups``; if ``policy`` is an image, ``critic`` has the terms."""
     rewards: Mapping[str, Reward]
-    """One for each name in ``config.rewards``."""
+    """Terms of the reward, at least one; each has a weight, beside it or in ``config.rewards``."""
     terminations: Mapping[str, Termination] = field(default_factory=dict)
     """Ends of an episode other than the clock."""
     commands: Mapping[str, Command] = field(default_factory=dict)
@@ -405,15 +414,16 @@ class Declaration:
             raise ValueError(f"observations: there is no group policy, only {there}")
 
     @property
-    def _nested(self) -> bool:
-        """Whether the observations are in several groups."""
-        return bool(self.observations) and all(isinstance(each, Mapping | Image) for each in self.observations.values())
+    def by_group(self) -> Mapping[str, Mapping[str, Observation] | Image]:
+        """The terms or the camera of each observation group; observations without groups are those of the policy."""
+        observations: Mapping[str, Any] = self.observations
+        nested = bool(observations) and all(isinstance(each, Mapping | Image) for each in observations.values())
+        return observations if nested else {"policy": observations}
 
     @property
     def groups(self) -> Mapping[str, Mapping[str, Observation]]:
         """The terms of each observation group that has terms; if the policy sees an image, the critic's terms are under ``policy``."""
-        nested: Mapping[str, Any] = self.observations if self._nested else {"policy": self.observations}
-        groups = {name: each for name, each in nested.items() if isinstance(each, Mapping)}
+        groups = {name: each for name, each in self.by_group.items() if isinstance(each, Mapping)}
         if "policy" in self.images and "critic" in groups:
             groups = {"policy": groups.pop("critic"), **groups}
         return groups
@@ -421,9 +431,7 @@ class Declaration:
     @property
     def images(self) -> Mapping[str, Image]:
         """The observation groups that are images."""
-        return (
-            {name: each for name, each in self.observations.items() if isinstance(each, Image)} if self._nested else {}
-        )
+        return {name: each for name, each in self.by_group.items() if isinstance(each, Image)}
 
 
 SECTIONS: Mapping[str, type[Term]] = {
