@@ -230,7 +230,7 @@ class TaskConfig(_Common):
         known = config.default_weights
         for name in config.rewards:
             if known and name not in known:
-                return ("rewards", name), f"{cls.__name__} has no term {shown(name)}; {nearest(name, known)}"
+                return ("rewards", name), f"the task has no term {shown(name)}; {nearest(name, known)}"
         for name in config.curriculum:
             if (
                 known and name != "level" and name not in known and "." not in name

@@ -37,29 +37,56 @@ def played(task: Task, steps: int = 3) -> Task:
 
 
 def test_the_tutorial_shows_the_example_as_it_is() -> None:
-    example = (REPOSITORY / "job_specs/my_task.py").read_text()
-    shown = blocks("own-task.md")[:5]
-    assert "".join("".join(shown).split()) == "".join(example.split('"""', 2)[2].split())
+    example = (REPOSITORY / "job_specs/my_task.py").read_text().split('"""', 2)[2].strip()
+    assert example in (block.strip() for block in blocks("own-task.md"))
+
+
+def test_a_reward_is_added_to_g1_in_eight_lines_and_drafted_in_torch(tmp_path: Path) -> None:
+    need_mjlab()
+    assert len([line for line in blocks("own-task.md")[0].splitlines() if line.strip()]) == 8
+    page = module("own-task.md", tmp_path)
+    tasks = [played(kind(kind.config_type(), 2, seed=1)) for kind in (page.Mine, page.Draft)]
+    sums = [task.state_dict()["episode_sums"][:, 2 + task.reward_terms.index("feet_flat")] for task in tasks]
+    assert (sums[0] < 0.0).all() and torch.allclose(*sums, rtol=1e-4)
+    calm = page.Calm.sketch(page.Calm.config_type())
+    assert "air_time" not in calm.reward_terms and calm.config.episode_seconds == 10.0
+    assert calm.config.ppo.learning_rate == 5e-4 and "push_robot" not in calm.declaration.events
+
+
+def test_mjlabs_side_of_the_tutorial_is_the_same(tmp_path: Path) -> None:
+    need_mjlab()
+    page = module("own-task.md", tmp_path, language="python mjlab")
+    assert page.cfg.rewards["feet_flat"].weight == -0.5
+    ours = find_task("job_specs.my_task:Pendulum")
+    task = ours.sketch(ours.config_type())
+    theirs = page.pendulum
+    assert {name: term.weight for name, term in theirs.rewards.items()} == task.plan.weights
+    assert [*theirs.observations["actor"].terms] == [*task.declaration.groups["policy"]]
+    assert [*theirs.events] == [*task.declaration.events] and [*theirs.actions] == [*task.declaration.actions]
+    assert theirs.episode_length_s == task.config.episode_seconds
+    assert theirs.decimation * theirs.sim.mujoco.timestep == pytest.approx(1.0 / task.config.control_hz)
 
 
 def test_the_tutorials_further_tasks_run(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
-    task = played(page.Everything(page.PendulumConfig(), 3, seed=1), 40)
+    task = played(page.Everything(page.Everything.config_type(), 3, seed=1), 40)
     assert task.groups["policy"].shape == (3, 6) and task.groups["critic"].shape == (3, 8)
     assert {"metric_power", "termination_spins", "termination_bored"} <= set(task.statistic_names)
     angle, velocity = task.worlds.state.joint_q.numpy(), task.worlds.state.joint_qd.numpy()
     energy = 0.5 * (-9.81 * 0.25) * math.cos(angle[1]) + 0.5 * 0.25 / 6.0 * velocity[1] ** 2
     assert task.groups["critic"][1, 7].item() == pytest.approx(0.2 * energy, rel=1e-4)
     assert "wanted: 1 x (rad - 0)" in page.contract(task)
-    assert page.Chooser.sketch(page.PendulumConfig()).action_names == ("left", "none", "right")
-    assert page.CheckedConfig(torque=0.5).torque == 0.5
+    assert page.Chooser.sketch(page.Chooser.config_type()).action_names == ("left", "none", "right")
+    assert page.Judged.sketch(page.Judged.config_type()).success == "still"
+    torqued = page.Torqued.sketch(page.TorquedConfig(torque=0.5))
+    assert torqued.plan.numbers.values[torqued.plan.numbers.places["actions.torque.scale"][0]] == 0.5
     with pytest.raises(ValueError, match="torque"):
-        page.CheckedConfig(torque=2.0)
+        page.TorquedConfig(torque=2.0)
 
 
 def test_a_cube_beside_the_pendulum_falls_onto_the_ground(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
-    task = played(page.WithCube(page.PendulumConfig(), 2, seed=1), 30)
+    task = played(page.WithCube(page.WithCube.config_type(), 2, seed=1), 30)
     assert task.observation_names[-1] == "cube"
     assert task.observations[:, 3].tolist() == pytest.approx([0.05, 0.05], abs=3e-3)
 
@@ -80,16 +107,10 @@ def test_the_tutorials_jobs_fit_the_example() -> None:
 def test_the_page_s_error_for_a_wrong_parameter_is_the_real_one(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
 
-    class Pendulum(page.Pendulum):
-        def declare(self, config):
-            return page.dataclasses.replace(
-                super().declare(config),
-                rewards={**super().declare(config).rewards, "upright": page.Reward(page.pointing, targt=1.0)},
-            )
-
+    wrong = page.Pendulum.with_(rewards={"upright": page.Reward(page.pointing, weight=1.0, targt=1.0)})
     line = next(line for line in (REPOSITORY / "docs/own-task.md").read_text().splitlines() if "targt" in line)
     with pytest.raises(ValueError, match="targt") as caught:
-        Pendulum.sketch(page.PendulumConfig())
+        wrong.sketch(wrong.config_type())
     assert str(caught.value) == line
 
 

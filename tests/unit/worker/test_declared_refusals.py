@@ -125,7 +125,7 @@ MISFITS: dict[str, Any] = {
         terms.joint_position, robot="cube"
     ),
     "rewards.place.limit: expected a number, found (1.0, 2.0)": Reward(terms.joint_velocity_excess, limit=(1.0, 2.0)),
-    "rewards.plce: SlidersConfig.rewards has no weight of this name; did you mean place?": Reward(terms.alive),
+    "rewards.plce: it has no weight; give it one, such as Reward(…, weight=-1.0)": Reward(terms.alive),
     "terminations.typo: far_away has no parameter limt; did you mean limit?": Termination(far_away, limt=3.0),
     "terminations.out: far_away needs limit=float": Termination(far_away),
     "terminations.both: far_away has no parameter limt; did you mean limit?": Termination(

@@ -155,7 +155,7 @@ class Binder:
             if name in found.parameters and name not in term.parameters:
                 view = self._view(place, term.robot)
                 bound.chosen[name], _ = find(place, view, element, getattr(term, name))
-            elif getattr(term, name) not in (None, "*"):
+            elif getattr(term, name) != ("*" if element == "joint" else None):
                 raise ValueError(f"{place}: {term.function_name} has no parameter {name}; leave {name}= out")
         try:
             found.bind("the task", **term.parameters, **bound.chosen)

@@ -11,7 +11,7 @@ import warp as wp
 
 from shared_store.contract.error_text import nearest
 from worker.settings.camera import CameraConfig
-from worker.settings.task import TaskConfig
+from worker.settings.task import FACTORS, TaskConfig
 from worker.simulation.declared_randomization import Randomize
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
@@ -35,6 +35,8 @@ _FACTORS: Mapping[str, tuple[str, Mapping[str, Any]]] = {
     "gravity": ("gravity", {}),
 }
 """Quantity and parts of each factor of ``config.randomize``."""
+FACTOR_STREAMS = {FACTOR.format(name): -1 - number for number, name in enumerate(FACTORS)}
+"""Numbers of their random streams: what one is does not depend on what else is drawn."""
 
 
 @wp.func

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from shared_store.contract.error_text import nearest
+from shared_store.contract.error_text import nearest, shown
 from worker.settings.task import TaskConfig
 from worker.simulation.actuators import Input
 from worker.simulation.patterns import resolve
@@ -330,7 +330,7 @@ class KernelPlan:
         for name in given:
             if name not in declared:
                 near = nearest(name, declared) if declared else "it declares none"
-                raise ValueError(f"config.rewards.{name}: the task declares no such term; {near}")
+                raise ValueError(f"config.rewards.{name}: the task has no term {shown(name)}; {near}")
         if not declared:
             raise ValueError("rewards: there is none; declare one, such as Reward(terms.alive, weight=1.0)")
         names = [*config.default_weights, *(name for name in declared if name not in config.default_weights)]

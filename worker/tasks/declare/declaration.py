@@ -392,18 +392,18 @@ class Declaration:
                     if section == "curricula" and isinstance(term, Adaptive):
                         continue
                     if not isinstance(term, kind):
-                        raise ValueError(f"{where}: expected {_a(kind.__name__)}, found {_a(type(term).__name__)}")
+                        raise ValueError(f"{where}: expected {_a(kind.__name__)}, found {a_type(term)}")
         for name, entry in self.randomize.items():
             if not isinstance(entry, Randomize):
-                raise ValueError(f"randomize.{name}: expected a Randomize, found {_a(type(entry).__name__)}")
+                raise ValueError(f"randomize.{name}: expected a Randomize, found {a_type(entry)}")
         for name, sensor in self.sensors.items():
             if not isinstance(name, str) or not NAME.fullmatch(name):
                 raise ValueError(
                     f"sensors.{name}: a name has small letters, digits and underscores, and begins with a letter"
                 )
-            if not all(hasattr(sensor, each) for each in ("arrays_type", "rows", "build")):
+            if isinstance(sensor, type) or not all(hasattr(sensor, each) for each in ("arrays_type", "rows", "build")):
                 raise ValueError(
-                    f"sensors.{name}: expected a sensor, such as ContactSensor(...), found {_a(type(sensor).__name__)}"
+                    f"sensors.{name}: expected a sensor, such as ContactSensor(...), found {a_type(sensor)}"
                 )
         if "policy" not in self.groups:
             there = ", ".join(self.observations)
@@ -452,6 +452,11 @@ TorchFunction = Callable[..., Any]
 def _several(names: Any) -> tuple[Any, ...]:
     """Names as a tuple; a single name becomes a tuple of one."""
     return tuple(names) if isinstance(names, Sequence) and not isinstance(names, str) else (names,)
+
+
+def a_type(value: Any) -> str:
+    """The type of a value, for errors: ``"an Event"``; of a class: ``"the class Event"``."""
+    return f"the class {value.__name__}" if isinstance(value, type) else _a(type(value).__name__)
 
 
 def _a(name: str) -> str:

@@ -73,7 +73,7 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         """Begin a new episode in every world.
 
         Args:
-            seed: The worlds become those of this seed, as if they had just been built; only the physics and scenes that
+            seed: The worlds become those of this seed, as if they had just been built; only the scenes that
                 ``config.randomize`` drew at the construction stay. None: their random streams continue.
             options: Not used by any task.
 

@@ -83,7 +83,8 @@ class Sketch(Telling):
         """
         check_parts(cls, parts)
         settings = changed_settings(cls, config or {}, parts.get("rewards") or {})
-        members = {"__doc__": cls.__doc__, "config_type": settings, "changes": (*cls.changes, parts)}
+        about = f"{cls.__name__} with other {', '.join((*parts, *config or ()))}."
+        members = {"__doc__": about, "config_type": settings, "changes": (*cls.changes, parts)}
         members["__module__"] = sys._getframe(1).f_globals.get("__name__", cls.__module__)
         metaclass: Any = type(cls)
         changed_task: type[Self] = metaclass(cls.__name__, (cls,), members)

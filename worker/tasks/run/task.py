@@ -20,6 +20,7 @@ from worker.simulation.robot_view import body_arrays
 from worker.simulation.sensors.camera import Camera
 from worker.simulation.sensors.sensor import SensorContext
 from worker.simulation.worlds import Worlds
+from worker.tasks.compile.configured import FACTOR_STREAMS
 from worker.tasks.compile.contract import contract
 from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.compile.numbers import flat
@@ -223,6 +224,7 @@ class Task(Sketch):
                 self.views,
                 self.robots,
                 self.config.control_hz,
+                FACTOR_STREAMS,
             )
             for place, value in self.config.numbers.items():
                 if place.startswith("randomize."):
@@ -329,7 +331,7 @@ class Task(Sketch):
     def restart(self, seed: int, first_world: int) -> None:
         """Turn the worlds into those of another seed or global index, as if they had just been built.
 
-        The physics and the scene that ``config.randomize`` drew for each world stay as they are (``config.randomize.draws_worlds``).
+        The scene that ``config.randomize`` drew for each world stays as it is.
 
         Args:
             seed: Any integer >= 0.
@@ -345,9 +347,7 @@ class Task(Sketch):
         self.reset()
 
     def seed(self, seed: int) -> None:
-        """Restart all random streams from another seed; the worlds change at their next reset.
-
-        The physics that ``randomize`` drew at construction stays.
+        """Restart all random streams from another seed; the worlds change at their next reset, their physics at a restart.
 
         Args:
             seed: Any integer >= 0.

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any, get_type_hints
 
-from shared_store.contract.error_text import nearest, shown
+from shared_store.contract.error_text import nearest
 from worker.settings.overrides import Refused, configured, training_sections
 from worker.settings.task import TaskConfig, default_rewards, reward_weights
-from worker.tasks.declare.declaration import Choice, Declaration, Image
+from worker.tasks.declare.declaration import Choice, Declaration, Image, a_type
 
 if TYPE_CHECKING:
     from worker.tasks.run.sketch import Sketch
@@ -27,12 +27,12 @@ def check_parts(task: type[Sketch], parts: Mapping[str, Any]) -> None:
             continue
         if not isinstance(part, Mapping):
             raise ValueError(
-                f"{where}: {section} is {shown(part)}; give parts by name, such as {section}={{'name': …}}"
+                f"{where}: {section} is {a_type(part)}; give parts by name, such as {section}={{'name': …}}"
             )
         for group, terms in part.items() if section == "observations" else ():
             if not isinstance(terms, Mapping | Image | None):
                 raise ValueError(
-                    f"{where}: observations.{group} is {shown(terms)}; observations are by group, such as "
+                    f"{where}: observations.{group} is {a_type(terms)}; observations are by group, such as "
                     "observations={'policy': {'name': …}}"
                 )
 
