@@ -83,7 +83,7 @@ class Sketch(Telling):
         """
         check_parts(cls, parts)
         settings = changed_settings(cls, config or {}, parts.get("rewards") or {})
-        about = f"{cls.__name__} with other {', '.join((*parts, *config or ()))}."
+        about = f"{cls.__name__} with other {', '.join((*parts, *(config or ())))}."
         members = {"__doc__": about, "config_type": settings, "changes": (*cls.changes, parts)}
         members["__module__"] = sys._getframe(1).f_globals.get("__name__", cls.__module__)
         metaclass: Any = type(cls)
