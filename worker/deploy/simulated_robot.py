@@ -140,9 +140,9 @@ class SimulatedRobot:
 
         found: list[Message] = []
         described = {command.name: command for command in self.contract.commands}
-        for told in self.task.plan.commands:
-            command = described[told.bound.name]
-            memory = self.task.state_tensors()["memory"][0, told.first : told.first + len(command.names)]
+        for name, first in self.task.plan.binder.commands.items():
+            command = described[name]
+            memory = self.task.state_tensors()["memory"][0, first : first + len(command.names)]
             numbers = memory.double().tolist()
             if is_twist(command):
                 twist = self.messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))

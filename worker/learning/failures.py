@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from shared_store.contract.error_text import counted
 
 if TYPE_CHECKING:
-    from worker.tasks.run.task_report import Telling
+    from worker.tasks.run.task_report import TaskReport
 
 MOST = 10
 """Lines at once."""
@@ -22,7 +22,7 @@ class Failures:
         say: Writes a line to the log.
     """
 
-    def __init__(self, task: Telling, say: Callable[[str], None]) -> None:
+    def __init__(self, task: TaskReport, say: Callable[[str], None]) -> None:
         self._task, self._say = task, say
         self._known: set[str] = set()
 

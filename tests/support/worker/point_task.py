@@ -14,7 +14,7 @@ import torch
 
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import Randomization
-from worker.tasks.run.task_report import Telling
+from worker.tasks.run.task_report import TaskReport
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class PointConfig:
     ppo: PointPPO = field(default_factory=PointPPO)
 
 
-class Point(Telling):
+class Point(TaskReport):
     """Push a point to the middle: 2 observations (place, velocity), 1 action."""
 
     config_type = PointConfig

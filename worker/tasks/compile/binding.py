@@ -86,7 +86,7 @@ class Binder:
         numbers: All numbers of the bound terms.
         structs: Variables of structs in the kernels, and their types.
         commands: First column in memory of each command, by name.
-        told: Count of the numbers of each command that the policy sees.
+        visible: Count of the numbers of each command that the policy sees.
         hidden: Count of the hidden numbers of each command, which follow those.
         memory: Number of allocated columns of ``episodes.memory``.
         lasting: Number of allocated columns of ``episodes.lasting``.
@@ -98,7 +98,7 @@ class Binder:
         self.numbers = Numbers()
         self.structs: dict[str, Any] = {}
         self.commands: dict[str, int] = {}
-        self.told: dict[str, int] = {}
+        self.visible: dict[str, int] = {}
         self.hidden: dict[str, int] = {}
         self.actions: list[str] = []
         self.indices: list[int] = []
@@ -181,7 +181,7 @@ class Binder:
             return [str(index) for index in range(needed.size)], f"elements of {found.name}"
         if needed.numbers:
             name = self._command_name(place, given.get("command"))
-            return [str(index) for index in range(self.told[name])], f"numbers of the command {name}"
+            return [str(index) for index in range(self.visible[name])], f"numbers of the command {name}"
         counts: dict[str, int] = {}
         names: list[str] = []
         for parameter, kind in found.parameters.items():
@@ -318,7 +318,7 @@ class Binder:
                 f"{place}: {term.function_name} hides {drawn.hidden} numbers, and hidden is {term.hidden}; leave hidden= out"
             )
         steering = needs_of(term.update.function) if term.update else drawn
-        self.commands[name], self.told[name] = self.memory, len(term.names)
+        self.commands[name], self.visible[name] = self.memory, len(term.names)
         self.hidden[name] = max(term.hidden, drawn.hidden, steering.hidden)
         self.memory += len(term.names) + self.hidden[name] + 1
 
@@ -327,23 +327,23 @@ class Binder:
             return next(iter(self.commands))
         if name not in self.commands:
             known = nearest(str(name), list(self.commands)) if self.commands else "the task declares none"
-            wanted = "say which command it is of, with command=" if name is None else f"there is no command {name!r}"
-            raise ValueError(f"{place}: {wanted}; {known}")
+            words = "say which command it is of, with command=" if name is None else f"there is no command {name!r}"
+            raise ValueError(f"{place}: {words}; {known}")
         return str(name)
 
     def _command(self, bound: Bound, name: Any) -> int:
         found = self._command_name(bound.place, name)
-        self.check_told(bound, found)
+        self.check_command(bound, found)
         return self.commands[found]
 
-    def check_told(self, bound: Bound, command: str) -> None:
+    def check_command(self, bound: Bound, command: str) -> None:
         """Refuse a term that reads or writes more numbers than its command has."""
         needed = needs_of(bound.term.function)
-        if needed.command > self.told[command] or needed.hidden > self.hidden[command]:
-            wanted = f"{needed.command} numbers" + (f" and {needed.hidden} hidden ones" if needed.hidden else "")
-            there = f"{self.told[command]}" + (f" and {self.hidden[command]}" if needed.hidden else "")
+        if needed.command > self.visible[command] or needed.hidden > self.hidden[command]:
+            expected = f"{needed.command} numbers" + (f" and {needed.hidden} hidden ones" if needed.hidden else "")
+            found = f"{self.visible[command]}" + (f" and {self.hidden[command]}" if needed.hidden else "")
             raise ValueError(
-                f"{bound.place}: {bound.term.function_name} needs a command of {wanted}; {command} has {there}"
+                f"{bound.place}: {bound.term.function_name} needs a command of {expected}; {command} has {found}"
             )
 
     def _struct(self, bound: Bound, name: str, kind: Any, given: Mapping[str, Any]) -> str:

@@ -18,7 +18,7 @@ import warp as wp
 from worker.tasks.compile.binding import Bound
 from worker.tasks.compile.external import TIME_OUT
 from worker.tasks.compile.observing import group_function
-from worker.tasks.compile.plan import KernelPlan, Told
+from worker.tasks.compile.plan import KernelPlan, Timed
 from worker.tasks.compile.source import Source, call_of, calls, loop, parameters_of
 from worker.tasks.declare.declaration import Event, Reward, Termination
 from worker.tasks.declare.functions import is_warp
@@ -275,47 +275,42 @@ def count_ends(plan: KernelPlan) -> list[str]:
 def running(source: Source) -> list[str]:
     """Commands and interval events of a world whose episode goes on."""
     lines: list[str] = []
-    for told in source.plan.commands:
-        column = f"episodes.memory[world, {told.countdown}]"
-        lines += [
-            f"{column} = {column} - 1.0",
-            f"if {column} < 0.5:",
-            *indent(drawn(source, told.bound, column, told.seconds)),
-            *updated(source, told),
-        ]
-    for event in source.plan.events:
-        if event.countdown < 0:
+    for timed in (*source.plan.commands, *source.plan.events):
+        if timed.countdown < 0:
             continue
-        column = f"episodes.memory[world, {event.countdown}]"
+        column = f"episodes.memory[world, {timed.countdown}]"
         lines += [
             f"{column} = {column} - 1.0",
             f"if {column} < 0.5:",
-            *indent(drawn(source, event.bound, column, event.seconds)),
+            *indent(drawn(source, timed)),
+            *updated(source, timed),
         ]
     return ["if not restart:", *indent(lines)] if lines else []
 
 
-def drawn(source: Source, bound: Bound, countdown: str, seconds: int) -> list[str]:
+def drawn(source: Source, timed: Timed) -> list[str]:
     """Call a term with a random stream of its own, and draw its duration."""
     return [
         "stream = random_stream(episodes, world)",
-        *wait(countdown, seconds),
-        *calls(source, bound, lambda call: [call]),
+        *wait(timed),
+        *calls(source, timed.bound, lambda call: [call]),
     ]
 
 
-def updated(source: Source, told: Told) -> list[str]:
+def updated(source: Source, timed: Timed) -> list[str]:
     """Call a command's update, in every step."""
-    if told.update is None:
+    if timed.update is None:
         return []
-    stream = ["stream = random_stream(episodes, world)"] if told.update.takes("stream") else []
-    return [*stream, *calls(source, told.update, lambda call: [call])]
+    stream = ["stream = random_stream(episodes, world)"] if timed.update.takes("stream") else []
+    return [*stream, *calls(source, timed.update, lambda call: [call])]
 
 
-def wait(countdown: str, seconds: int) -> list[str]:
+def wait(timed: Timed) -> list[str]:
     """Draw a time in control steps, at least one."""
-    ends = f"numbers[{seconds}], numbers[{seconds + 1}]"
-    return [f"{countdown} = wp.max(1.0, wp.round(wp.randf(stream, {ends}) / seconds))"]
+    ends = f"numbers[{timed.seconds}], numbers[{timed.seconds + 1}]"
+    return [
+        f"episodes.memory[world, {timed.countdown}] = wp.max(1.0, wp.round(wp.randf(stream, {ends}) / seconds))",
+    ]
 
 
 def reset(source: Source) -> list[str]:
@@ -328,13 +323,11 @@ def reset(source: Source) -> list[str]:
     lines += ["for k in range(episodes.actions.shape[1]):"]
     lines += ["    episodes.earlier_actions[world, k] = 0.0", "    episodes.last_actions[world, k] = 0.0"]
     lines += each(source, happening(plan, "reset"))
-    for told in plan.commands:
-        lines += drawn(source, told.bound, f"episodes.memory[world, {told.countdown}]", told.seconds)
-        lines += updated(source, told)
+    for command in plan.commands:
+        lines += drawn(source, command) + updated(source, command)
     for event in plan.events:
         if event.countdown >= 0:
-            lines += ["stream = random_stream(episodes, world)"]
-            lines += wait(f"episodes.memory[world, {event.countdown}]", event.seconds)
+            lines += ["stream = random_stream(episodes, world)", *wait(event)]
     return lines
 
 

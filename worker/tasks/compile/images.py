@@ -46,10 +46,10 @@ def cameras(
 
 def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
     """Refuse image groups that the configuration does not declare: submission checks jobs against it."""
-    told, kind = config.observation_groups, type(config).__name__
+    groups, kind = config.observation_groups, type(config).__name__
     there = [*declaration.groups, *declaration.images]
     for group in declaration.images:
-        if not told.get(group, False):
+        if not groups.get(group, False):
             raise ValueError(
                 f"observations.{group}: it is an image, and {kind} does not say so; give {kind} a "
                 f'further_groups: ClassVar = {{"{group}": True}}'

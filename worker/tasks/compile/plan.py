@@ -16,7 +16,7 @@ from worker.tasks.compile.acting import check_action, check_driven
 from worker.tasks.compile.binding import Binder, Bound
 from worker.tasks.compile.configured import deviations
 from worker.tasks.compile.contract import described
-from worker.tasks.compile.declaration_checks import check_command, check_observation, check_randomized
+from worker.tasks.compile.declaration_checks import check_command, check_observation, check_randomized, check_result
 from worker.tasks.compile.images import cameras
 from worker.tasks.compile.numbers import are_times, flat, in_order, is_amount
 from worker.tasks.declare.declaration import (
@@ -104,25 +104,17 @@ class Driven:
 
 
 @dataclass
-class Told:
-    """A command: its own term and the update of each step, its first column in memory, the column that counts its remaining
-    control steps, and the bounds of its duration.
+class Timed:
+    """A command or an event, with the update of a command in each step.
+
+    ``countdown`` is the column in memory of the control steps that are left, ``seconds`` the first number of the bounds of its duration
+    [s]; -1: it is not repeated.
     """
-
-    bound: Bound
-    update: Bound | None
-    first: int
-    countdown: int
-    seconds: int
-
-
-@dataclass
-class Happening:
-    """An event; for one at intervals, the column in memory of its countdown and the numbers of its bounds [s]."""
 
     bound: Bound
     countdown: int = -1
     seconds: int = -1
+    update: Bound | None = None
 
 
 class KernelPlan:
@@ -207,10 +199,9 @@ class KernelPlan:
         """Every bound term."""
         yield from (each.bound for each in self.driven)
         yield from [self.choice] if self.choice else []
-        for told in self.commands:
-            yield from [told.bound, *([told.update] if told.update else [])]
+        for timed in (*self.commands, *self.events):
+            yield from [timed.bound, *([timed.update] if timed.update else [])]
         yield from (*self.rewards, *self.metrics, *self.terminations, *self.curricula)
-        yield from (each.bound for each in self.events)
         for group in self.groups.values():
             yield from (seen.bound for seen in group)
 
@@ -309,17 +300,17 @@ class KernelPlan:
             return Column(self.numbers.add(place, value, 1), False)
         return Column(self.numbers.add(place, value, len(names)), True)
 
-    def _command(self, name: str, term: Command) -> Told:
+    def _command(self, name: str, term: Command) -> Timed:
         first, place = self.binder.commands[name], f"commands.{name}"
-        own = {"command": str(first), "stream": "stream"}
+        own = {"command": str(first), **DRAWN}
         bound = self._bind("commands", name, term, element=False, own=own)
         update = None
         if term.update is not None:
             update = self._bind("commands", f"{name}.update", term.update, element=False, own=own)
-            self.binder.check_told(update, name)
-        countdown = first + self.binder.told[name] + self.binder.hidden[name]
+            self.binder.check_command(update, name)
+        countdown = first + self.binder.visible[name] + self.binder.hidden[name]
         seconds = self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times)
-        return Told(bound, update, first, countdown, seconds)
+        return Timed(bound, countdown, seconds, update)
 
     def _weigh(self, config: TaskConfig) -> dict[str, float]:
         """The weight of each reward: that of ``config.rewards``, or else the one beside the term.
@@ -341,17 +332,17 @@ class KernelPlan:
             flat(f"rewards.{name}.weight", weight, 1)
         return {name: float(weight) for name, weight in found.items() if weight is not None}
 
-    def _event(self, name: str, term: Event) -> Happening:
+    def _event(self, name: str, term: Event) -> Timed:
         place = f"events.{name}"
         bound = self._bind("events", name, term, own=DRAWN)
         if term.when not in ("reset", "interval", "startup"):
             raise ValueError(f"{place}: when is {term.when!r}; it is reset, interval or startup")
         if term.when != "interval":
-            return Happening(bound)
+            return Timed(bound)
         if term.seconds is None:
             raise ValueError(f"{place}: an interval needs seconds=(least, greatest), above 0")
         column, self.binder.memory = self.binder.memory, self.binder.memory + 1
-        return Happening(bound, column, self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times))
+        return Timed(bound, column, self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times))
 
     def _group(self, group: str, terms: Mapping[str, Observation]) -> list[Seen]:
         if not terms:
@@ -410,26 +401,6 @@ class KernelPlan:
         if "critic" in self.groups or not any(seen.noises or seen.past >= 0 for seen in policy):
             return None
         return [dataclasses.replace(seen, noises=[], past=-1) for seen in policy]
-
-
-def check_result(bound: Bound, section: str) -> None:
-    """Refuse a function whose result its section can't use."""
-    if bound.signature is None:
-        if section in ("events", "commands", "actions", "curricula"):
-            raise ValueError(
-                f"{bound.place}: a torch term observes, rewards or ends an episode; write this one as a @wp.func"
-            )
-        if section in ("rewards", "metrics", "terminations") and bound.width != 1:
-            raise ValueError(f"{bound.place}: size is {bound.width}; a term of this section gives one number a world")
-        return
-    returns = bound.signature.returns
-    name = bound.signature.name
-    if section in ("rewards", "metrics") and (returns is None or bound.width != 1):
-        raise ValueError(f"{bound.place}: {name} must give a float (-> float), one number a world or element")
-    if section == "terminations" and returns is not bool:
-        raise ValueError(f"{bound.place}: {name} must give a bool (-> bool): whether the episode ends")
-    if section.startswith("observations") and returns is None:
-        raise ValueError(f"{bound.place}: {name} gives nothing; annotate its result, such as -> float")
 
 
 def column_names(place: str, name: str, term: Observation, bound: Bound) -> list[str]:

@@ -43,12 +43,12 @@ def tables(plan: KernelPlan) -> dict[str, list[Row]]:
         of = "metric" if plan.declaration.success in plan.declaration.metrics else "termination"
         found["success"] = [{of: plan.declaration.success}]
     found["commands"] = [
-        _term(plan, told.bound)
+        _term(plan, command.bound)
         | {
-            "numbers": ", ".join(plan.declaration.commands[told.bound.name].names),
-            "every": _seconds(plan, told.seconds),
+            "numbers": ", ".join(plan.declaration.commands[command.bound.name].names),
+            "every": _seconds(plan, command.seconds),
         }
-        for told in plan.commands
+        for command in plan.commands
     ]
     found["events"] = [
         _term(plan, event.bound)

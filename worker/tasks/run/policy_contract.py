@@ -143,10 +143,10 @@ def _sensor(declared: Any) -> str:
 
 def _commands(plan: KernelPlan) -> tuple[Command, ...]:
     found = []
-    for told in plan.commands:
-        name, command = told.bound.name, plan.declaration.commands[told.bound.name]
+    for timed in plan.commands:
+        name, command = timed.bound.name, plan.declaration.commands[timed.bound.name]
         ranges: Sequence[Any] = [range_of(plan, name, command, column) for column in command.names]
-        seconds = (plan.numbers.values[told.seconds], plan.numbers.values[told.seconds + 1])
+        seconds = (plan.numbers.values[timed.seconds], plan.numbers.values[timed.seconds + 1])
         drawn = (command.function_name, is_library(command))
         found.append(Command(name, command.names, tuple(command.units), tuple(ranges), seconds, *drawn))
     return tuple(found)
@@ -158,10 +158,10 @@ def same_policy(contract: Contract, of: Contract) -> Contract:
     A task alone doesn't know these parts. They can't differ, since they follow from the settings with which a policy is loaded.
     """
     groups = []
-    for told in of.groups:
-        group = contract.group(told.name)
+    for former in of.groups:
+        group = contract.group(former.name)
         if group is not None:
-            groups.append(dataclasses.replace(group, input=told.input))
+            groups.append(dataclasses.replace(group, input=former.input))
     return dataclasses.replace(contract, groups=tuple(groups), states=of.states, normalizer=of.normalizer)
 
 

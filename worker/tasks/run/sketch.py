@@ -21,11 +21,11 @@ from worker.tasks.compile.configured import configured
 from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.compile.plan import KernelPlan, stacked
 from worker.tasks.declare.declaration import Choice, Declaration
-from worker.tasks.run.task_report import Telling
+from worker.tasks.run.task_report import TaskReport
 from worker.tasks.run.variants import changed, changed_settings, check_parts
 
 
-class Sketch(Telling):
+class Sketch(TaskReport):
     """The part of :class:`worker.tasks.run.task.Task` that needs no worlds; a task overrides its methods up to :meth:`build`.
 
     Attributes:

@@ -297,7 +297,7 @@ class Task(Sketch):
         return {name: sampling.own_failures() for name, sampling in self._samplings.items()}
 
     def take_counts(self, others: Mapping[str, torch.Tensor]) -> None:
-        """See :meth:`Telling.take_counts`."""
+        """See :meth:`TaskReport.take_counts`."""
         for name, failures in others.items():
             self._samplings[name].take_failures(failures)
 
