@@ -76,8 +76,8 @@ SECTIONS: Mapping[str, dict[str, Any]] = {
     f"commands.target.seconds: {TWO}'a'": commanded(seconds="a"),
     "commands.target.seconds: expected the least and the greatest time, above 0": commanded(seconds=(0.0, 1.0)),
     "commands.target: 2 units for 1 numbers; give one for each": commanded(units=("m", "s")),
-    "commands.target: names are (); name each number that the policy is told": commanded(names=()),
-    "commands.target: names are (3,); name each number that the policy is told": commanded(names=3),
+    "commands.target: names are (); name each number that the policy sees": commanded(names=()),
+    "commands.target: names are (3,); name each number that the policy sees": commanded(names=3),
     "commands.target: hidden is -1; give how many numbers, from 0 up": commanded(hidden=-1),
     f"events.e.seconds: {TWO}2.0": every(2.0),
     f"events.e.seconds: {TWO}(2.0,)": every((2.0,)),
@@ -156,7 +156,7 @@ def test_other_refusals() -> None:
         Sliders.sketch(SlidersConfig(numbers={"rewards.plac.x": 1.0}))
     with pytest.raises(ValueError, match=r"config.numbers.actions.force.scale: expected 2 numbers, found 1.0"):
         Sliders.sketch(SlidersConfig(numbers={"actions.force.scale": 1.0}))
-    with pytest.raises(ValueError, match=r"rewards.Place: a term's name has small letters, digits and underscores"):
+    with pytest.raises(ValueError, match=r"rewards.Place: a name has small letters, digits and underscores"):
         Declaration(actions={}, observations={}, rewards={"Place": Reward(terms.alive)})
     with pytest.raises(ValueError, match=r"observations.policy.place: expected an Observation, found a Reward"):
         Declaration(actions={}, observations={"place": Reward(terms.alive)}, rewards={})

@@ -8,12 +8,13 @@ compiles nothing, and a job's YAML sets them under ``train.config.numbers`` by t
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from shared_store.contract.policy import Target
 from worker.simulation.declared_randomization import Randomize
+from worker.tasks.declare.adaptive import Adaptive as Adaptive
 
 Pattern = str | Sequence[str]
 """Names of joints, bodies or sites, one or several, with ``*`` for any letters; they are selected in the order of the model."""
@@ -183,54 +184,6 @@ class Curriculum(Term):
     """
 
 
-@dataclass(frozen=True)
-class Adaptive:
-    """A number that adapts to the policy's performance: the same in all worlds of all ranks, and part of a run's state.
-
-    Before each iteration it goes one step from ``start`` towards ``end`` if the mean of the episodes that ended last is above
-    ``above``, and one step back if it is below ``below``. An evaluation of a checkpoint uses the training's value.
-
-    Args:
-        place: Place of the number, such as ``events.push.speed``; at a place with several numbers, all change.
-        start: Its first value.
-        end: Its last value.
-        steps: Number of steps between the two.
-        above: Mean above which it takes a step forward.
-        below: Mean below which it takes a step back; None: never.
-        of: The quantity of the mean, ``"return"`` or ``"length"`` [steps].
-    """
-
-    place: str
-    start: float
-    end: float
-    steps: int = 20
-    above: float = 0.0
-    below: float | None = None
-    of: Literal["return", "length"] = "return"
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"Adaptive of {self.place}: steps is {self.steps}; use 1 or more")
-        if self.below is not None and self.below >= self.above:
-            raise ValueError(
-                f"Adaptive of {self.place}: below is {self.below}, which must be less than above, {self.above}"
-            )
-        if self.of not in ("return", "length"):
-            raise ValueError(f"Adaptive of {self.place}: of is {self.of!r}; it is return or length")
-
-    def after(self, step: float, reward: float | None, episode_length: float | None) -> float:
-        """The step, from 0 to :attr:`steps`, that follows ``step``."""
-        mean = reward if self.of == "return" else episode_length
-        if mean is None:
-            return step
-        moved = step + (mean > self.above) - (self.below is not None and mean < self.below)
-        return min(max(moved, 0.0), float(self.steps))
-
-    def value(self, step: float) -> float:
-        """The number at a step."""
-        return self.start + (self.end - self.start) * step / self.steps
-
-
 class Observation(Term):
     """A term of an observation group: float or vector, one for each element, in order.
 
@@ -381,10 +334,7 @@ class Declaration:
             for group, terms in entries.items():
                 for name, term in terms.items():
                     where = ".".join(filter(None, (section, group, str(name))))
-                    if not isinstance(name, str) or not NAME.fullmatch(name):
-                        raise ValueError(
-                            f"{where}: a term's name has small letters, digits and underscores, and begins with a letter"
-                        )
+                    _check_name(where, name)
                     if isinstance(term, Image):
                         raise ValueError(
                             f'observations.{name}: an Image is a group of its own; write observations={{"policy": {{…}}, "{name}": …}}'
@@ -397,10 +347,7 @@ class Declaration:
             if not isinstance(entry, Randomize):
                 raise ValueError(f"randomize.{name}: expected a Randomize, found {a_type(entry)}")
         for name, sensor in self.sensors.items():
-            if not isinstance(name, str) or not NAME.fullmatch(name):
-                raise ValueError(
-                    f"sensors.{name}: a name has small letters, digits and underscores, and begins with a letter"
-                )
+            _check_name(f"sensors.{name}", name)
             if isinstance(sensor, type) or not all(hasattr(sensor, each) for each in ("arrays_type", "rows", "build")):
                 raise ValueError(
                     f"sensors.{name}: expected a sensor, such as ContactSensor(...), found {a_type(sensor)}"
@@ -446,7 +393,10 @@ SECTIONS: Mapping[str, type[Term]] = {
 }
 """The sections of a declaration and the types of their terms."""
 
-TorchFunction = Callable[..., Any]
+
+def _check_name(where: str, name: Any) -> None:
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise ValueError(f"{where}: a name has small letters, digits and underscores, and begins with a letter")
 
 
 def _several(names: Any) -> tuple[Any, ...]:

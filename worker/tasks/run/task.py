@@ -166,19 +166,8 @@ class Task(Sketch):
 
     def _allocate(self) -> None:
         """Allocate every buffer once, as views that torch and Warp share."""
-        plan = self.plan
         self._causes = mishap_causes(self.reward_terms, (*self.observation_names, *self.further_names))
-        self._buffers = buffers = Buffers(
-            self.worlds,
-            actions=1 if self.discrete else self.action_size,
-            observations=len(self.observation_names),
-            weights=list(plan.weights.values()),
-            metrics=len(self.metric_names),
-            memory=plan.binder.memory,
-            lasting=plan.binder.lasting,
-            statistics=len(self.statistic_names),
-            causes=len(self._causes),
-        )
+        self._buffers = buffers = Buffers(self, len(self._causes))
         self._episodes = buffers.arrays
         self.actions = buffers["actions"]
         self.states = self.observations = buffers["observations"]
