@@ -146,9 +146,8 @@ def _commands(plan: KernelPlan) -> tuple[Command, ...]:
     for timed in plan.commands:
         name, command = timed.bound.name, plan.declaration.commands[timed.bound.name]
         ranges: Sequence[Any] = [range_of(plan, name, command, column) for column in command.names]
-        seconds = (plan.numbers.values[timed.seconds], plan.numbers.values[timed.seconds + 1])
-        drawn = (command.function_name, is_library(command))
-        found.append(Command(name, command.names, tuple(command.units), tuple(ranges), seconds, *drawn))
+        drawn = (plan.numbers.pair(timed.seconds), command.function_name, is_library(command))
+        found.append(Command(name, command.names, tuple(command.units), tuple(ranges), *drawn))
     return tuple(found)
 
 
