@@ -266,7 +266,6 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
     from worker.learning.setup import check_fit, check_robots
     from worker.tasks import find_task
     from worker.tasks.run.policy_contract import policy_contract, same_policy
-    from worker.tasks.run.task import Task
 
     try:
         manifest, contract = verify(bundle), read_contract(bundle)
@@ -277,8 +276,6 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
     CHANGED_ROBOTS.set(accept)
     with user_errors():
         task = task_type(configure(task_type, manifest["train"]), 1, seed=seed, device="cpu")
-    if not isinstance(task, Task) or "robot" not in task.views:
-        raise UserError(f"task {contract.task} declares no robot; a task of kernels by hand can't be a simulated robot")
     if task.discrete or any(action.rule or not action.scale for action in contract.actions):
         raise UserError(f"task {contract.task}: joint commands can't be turned back into its actions")
     now, of = same_policy(policy_contract(task, contract.task), contract), f"bundle {bundle}"

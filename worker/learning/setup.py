@@ -84,8 +84,7 @@ def spaces_of(task: Task) -> Spaces:
 
 def action_ranges(task: Task) -> tuple[tuple[float, float] | None, ...]:
     """See :attr:`LearningSetting.action_ranges`."""
-    interface = None if task.discrete else task.interface()
-    return tuple(action.clip for action in interface.actions) if interface else ()
+    return () if task.discrete else tuple(action.clip for action in task.interface().actions)
 
 
 def spaces_from(policy: dict[str, Any]) -> Spaces:

@@ -148,8 +148,6 @@ class Stage:
 
 def _seen(task_type: type[Task]) -> type[Task]:
     """The task, with the geoms of its robots that are only seen."""
-    if not issubclass(task_type, Task):
-        return task_type
 
     def robot(self: Any, config: Any) -> Any:
         return _with_visuals(task_type.robot(self, config))
@@ -162,7 +160,7 @@ def _seen(task_type: type[Task]) -> type[Task]:
 
 def _robot_file(sketch: Task, config: TaskConfig) -> tuple[str, str] | None:
     """Name and text of the robot's file; None where it is binary, or the task has no such file."""
-    file = getattr(sketch.robot(config), "file", None) if isinstance(sketch, Task) else None
+    file = getattr(sketch.robot(config), "file", None)
     if file is None:
         return None
     found = robot_files.read(file)

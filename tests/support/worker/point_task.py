@@ -7,13 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import torch
 
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import Randomization
+from worker.tasks.compile.binding import Bound
+from worker.tasks.compile.plan import Seen
+from worker.tasks.declare.declaration import Observation
+from worker.tasks.declare.interface import Interface
 from worker.tasks.run.task_report import TaskReport
 
 
@@ -56,6 +60,7 @@ class Point(TaskReport):
     shown_metrics = MappingProxyType[str, str]({})
     action_size, discrete, observation_shape = 1, False, (2,)
     action_names = ("push",)
+    readings = MappingProxyType[str, Any]({})
     observation_names = ("place", "velocity")
     ended = None
     adapting = None
@@ -132,8 +137,17 @@ class Point(TaskReport):
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         pass
 
-    def interface(self) -> None:
-        return None
+    def interface(self) -> Interface:
+        return Interface((), ())
+
+    @property
+    def plan(self) -> Any:
+        """As much of a plan as a contract reads: a term for each observation."""
+        seen = [
+            Seen(Bound(f"observations.{name}", Observation(Point.step), None), [name], column, None, None, [], None, -1)
+            for column, name in enumerate(self.observation_names)
+        ]
+        return SimpleNamespace(groups={"policy": seen}, images={}, commands=())
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         names = ("place", "velocity", "observations", "episode_length", "_draws", "_steps", "_sums")
