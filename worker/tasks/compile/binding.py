@@ -12,6 +12,7 @@ from shared_store.contract.error_text import nearest, shown
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.tasks import terms
+from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.compile.numbers import EXPRESSIONS, Numbers, stays
 from worker.tasks.declare.declaration import Command, Pattern, Term
 from worker.tasks.declare.functions import (
@@ -123,10 +124,8 @@ class Binder:
                 raise ValueError(f"{place}: {name} is {shown(count)}; give a whole number from {least} up")
         if not is_warp(term.function):
             return self._bind_torch(place, term)
-        try:
+        with placed(place):
             found = signature(term.function)
-        except ValueError as error:
-            raise ValueError(f"{place}: {error}") from error
         bound = Bound(place, term, found, width=max(found.width, 1))
         given = dict(found.defaults) | term.parameters
         if found.element:
@@ -390,7 +389,7 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
     if pattern is None:
         plural = _PLURALS[element]
         raise ValueError(f"{place}: say which {plural} it is for, with {plural}=")
-    try:
+    with placed(place):
         if element == "joint":
             found = view.find_joints(pattern)
             return found, [view.joint_names[each] for each in found]
@@ -399,8 +398,6 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
             return [view.bodies[each] for each in found], [view.body_names[each] for each in found]
         found = view.find_sites(pattern)
         return found, [view.site_names[each] for each in found]
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
 
 
 def _function_instead(given: Any) -> str:

@@ -84,10 +84,8 @@ def check_randomized(
         raise ValueError(f"{where}: the task has no number {shown(place)}; {nearest(place, known) or 'it has none'}")
     count = entries[name].places[own]
     numbers = flat(f"{where}.{place}", [value] * count if fill else value, count)
-    try:
+    with placed(f"{where}.{place}"):
         entries[name].check_numbers(own, numbers)
-    except ValueError as error:
-        raise ValueError(f"{where}.{place}: {error}") from error
 
 
 def _is_number(value: Any) -> bool:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.contract.error_text import nearest
 from worker.settings.task import TaskConfig
 from worker.simulation.robot_view import RobotView
+from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.declare.declaration import Declaration
 
 if TYPE_CHECKING:
@@ -37,10 +38,8 @@ def cameras(
             what = no_camera if image.sensor in sensors else f"there is no camera {image.sensor!r}"
             raise ValueError(f"observations.{group}: {what}; {there}")
     for name in known:
-        try:
+        with placed(f"sensors.{name}"):
             sensors[name].rows(views)
-        except ValueError as error:
-            raise ValueError(f"sensors.{name}: {error}") from error
     return {group: image.sensor for group, image in declaration.images.items()}
 
 

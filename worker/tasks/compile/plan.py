@@ -16,7 +16,13 @@ from worker.tasks.compile.acting import check_action, check_driven
 from worker.tasks.compile.binding import Binder, Bound
 from worker.tasks.compile.configured import deviations
 from worker.tasks.compile.contract import described
-from worker.tasks.compile.declaration_checks import check_command, check_observation, check_randomized, check_result
+from worker.tasks.compile.declaration_checks import (
+    check_command,
+    check_observation,
+    check_randomized,
+    check_result,
+    placed,
+)
 from worker.tasks.compile.images import cameras
 from worker.tasks.compile.numbers import are_times, flat, in_order, is_amount
 from worker.tasks.declare.declaration import (
@@ -385,10 +391,8 @@ class KernelPlan:
         if not noise:
             return
         columns = [column for seen in self.groups["policy"] for column in described(self, seen)]
-        try:
+        with placed("config.randomize.observation_noise"):
             found = deviations(noise, columns)
-        except ValueError as error:
-            raise ValueError(f"config.randomize.observation_noise: {error}") from error
         for seen in self.groups["policy"]:
             mine, found = found[: len(seen.names)], found[len(seen.names) :]
             if any(mine):
@@ -431,10 +435,8 @@ def by_pattern(place: str, values: Mapping[str, float], names: list[str]) -> lis
     Raises:
         ValueError: A pattern fits no name, or a name has no pattern.
     """
-    try:
+    with placed(place):
         found: list[float | None] = resolve(names, values, "column")
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
     lacking = [name for name, value in zip(names, found, strict=True) if value is None]
     if lacking:
         raise ValueError(f"{place}: no pattern fits {lacking[0]}; add one, such as '*'")
