@@ -111,7 +111,7 @@ def test_a_cube_beside_the_pendulum_falls_onto_the_ground(tmp_path: Path) -> Non
 def test_the_tutorials_jobs_fit_the_example() -> None:
     page = (REPOSITORY / "docs/own-task.md").read_text()
     jobs = [yaml.safe_load(block) for block in re.findall(r"^```yaml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)]
-    jobs.append(yaml.safe_load((REPOSITORY / "job_specs/my-task.yaml").read_text()))
+    jobs.insert(0, yaml.safe_load((REPOSITORY / "job_specs/my-task.yaml").read_text()))
     assert len(jobs) == 2
     for job in jobs:
         task_type = find_task(job["train"]["task"])

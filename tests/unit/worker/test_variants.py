@@ -79,6 +79,8 @@ def test_parts_are_added_replaced_and_removed() -> None:
         "termination_time_out",
     )
     assert Cartpole.config_type().rewards["alive"] == 0.1, "the shipped task is as it was"
+    again = mine.with_(rewards={"tilt": Reward(tilt, joints="slider")}, observations={"critic": None}).sketch(config)
+    assert again.plan.weights["tilt"] == -0.5, "a term in place of another keeps its weight"
     other = Cartpole.with_(actions={"force": Action(terms.effort, joints="slider", scale=0.5)}).sketch(
         Cartpole.config_type()
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping
 from functools import partial
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 from shared_store.contract.error_text import nearest
 from worker.settings.overrides import Refused, configured, training_sections
 from worker.settings.task import TaskConfig, default_rewards, reward_weights
-from worker.tasks.declare.declaration import Choice, Declaration, Image, a_type
+from worker.tasks.declare.declaration import Choice, Declaration, Image, Reward, a_type
 
 if TYPE_CHECKING:
     from worker.tasks.run.sketch import Sketch
@@ -58,6 +59,11 @@ def changed(declaration: Declaration, parts: Mapping[str, Any]) -> Declaration:
         else:
             both = isinstance(old, Mapping) and isinstance(new, Mapping)
             found[section] = _merged(section, old, new) if both else new
+    for name, term in found.get("rewards", {}).items():
+        former = declaration.rewards.get(name)
+        if isinstance(term, Reward) and term.weight is None and former is not None:  # its weight stays
+            found["rewards"][name] = copy.copy(term)
+            found["rewards"][name].weight = former.weight
     return dataclasses.replace(declaration, **found)
 
 
