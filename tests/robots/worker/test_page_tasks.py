@@ -70,7 +70,7 @@ def test_mjlabs_side_of_the_tutorial_names_what_mjlab_has() -> None:
             elif isinstance(node, ast.ImportFrom):
                 found |= {each.asname or each.name: node for each in node.names}
                 if any(each.name == "*" for each in node.names):
-                    found |= names(f"{node.module}")
+                    found |= names(f"{module}.{node.module}" if node.level else f"{node.module}")
         return found
 
     imported, used = 0, set[str]()

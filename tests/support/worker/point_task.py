@@ -15,6 +15,7 @@ import torch
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import Randomization
 from worker.tasks.compile.binding import Bound
+from worker.tasks.compile.numbers import Numbers
 from worker.tasks.compile.plan import Seen
 from worker.tasks.declare.declaration import Observation
 from worker.tasks.declare.interface import Interface
@@ -147,7 +148,7 @@ class Point(TaskReport):
             Seen(Bound(f"observations.{name}", Observation(Point.step), None), [name], column, None, None, [], None, -1)
             for column, name in enumerate(self.observation_names)
         ]
-        return SimpleNamespace(groups={"policy": seen}, images={}, commands=())
+        return SimpleNamespace(groups={"policy": seen}, images={}, commands=(), numbers=Numbers())
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         names = ("place", "velocity", "observations", "episode_length", "_draws", "_steps", "_sums")

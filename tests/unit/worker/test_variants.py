@@ -53,15 +53,22 @@ def names(task: Task) -> dict[str, Any]:
 
 def test_parts_are_added_replaced_and_removed() -> None:
     mine = Cartpole.with_(
-        rewards={"tilt": Reward(tilt, weight=-0.5, joints="hinge"), "effort": None, "alive": Reward(terms.alive, weight=2.0)},
-        observations={"policy": {"velocity": None, "power": Observation(terms.joint_power, joints="slider")}, "critic": {}},
+        rewards={
+            "tilt": Reward(tilt, weight=-0.5, joints="hinge"),
+            "effort": None,
+            "alive": Reward(terms.alive, weight=2.0),
+        },
+        observations={
+            "policy": {"velocity": None, "power": Observation(terms.joint_power, joints="slider")},
+            "critic": {},
+        },
         terminations={"dropped_pole": None},
         metrics={"speed": Metric(terms.joint_speed)},
         events={"later": Event(terms.reset_to_default)},
         randomize={"mass": Randomize("mass", bodies="*", range=(0.5, 2.0))},
         success="speed",
         config={"episode_seconds": 2.0, "ppo": {"steps": 9}},
-    )  # fmt: skip
+    )
     assert issubclass(mine, Cartpole) and mine.__module__ == __name__ and mine.config_type is not Cartpole.config_type
     config = mine.config_type()
     assert (config.episode_seconds, config.ppo.steps, config.ppo.hidden_sizes) == (2.0, 9, (32, 32))
@@ -103,21 +110,51 @@ def test_a_yaml_overrides_the_weight_beside_a_term() -> None:
     ("parts", "words"),
     [
         ({"reward": {}}, "Cartpole.with_: a declaration has no part reward; did you mean rewards?"),
-        ({"rewards": Reward(tilt)}, "Cartpole.with_: rewards is a Reward; give parts by name, such as rewards={'name': …}"),
-        ({"observations": {"x": Observation(tilt)}}, "Cartpole.with_: observations.x is an Observation; observations are by group,"),
-        ({"config": {"episode_second": 1}}, "task Cartpole: config.episode_second: CartpoleConfig has no such key; did"),
-        ({"config": {"substeps": 0}}, "task Cartpole: config.substeps: expected a value greater than or equal to 1, found 0"),
-        ({"rewards": {"efort": None}}, "task Cartpole: rewards.efort: there is nothing of this name to remove; did you mean effort?"),
-        ({"rewards": {"tilt": Reward(tilt)}}, "task Cartpole: rewards.tilt: it has no weight; give it one, such as Reward(…, we"),
-        ({"rewards": {"tilt": Reward(tilt, weight="much")}}, "task Cartpole: rewards.tilt.weight: expected a number, found"),  # type: ignore[arg-type]
+        (
+            {"rewards": Reward(tilt)},
+            "Cartpole.with_: rewards is a Reward; give parts by name, such as rewards={'name': …}",
+        ),
+        (
+            {"observations": {"x": Observation(tilt)}},
+            "Cartpole.with_: observations.x is an Observation; observations are by group,",
+        ),
+        (
+            {"config": {"episode_second": 1}},
+            "task Cartpole: config.episode_second: CartpoleConfig has no such key; did",
+        ),
+        (
+            {"config": {"substeps": 0}},
+            "task Cartpole: config.substeps: expected a value greater than or equal to 1, found 0",
+        ),
+        (
+            {"rewards": {"efort": None}},
+            "task Cartpole: rewards.efort: there is nothing of this name to remove; did you mean effort?",
+        ),
+        (
+            {"rewards": {"tilt": Reward(tilt)}},
+            "task Cartpole: rewards.tilt: it has no weight; give it one, such as Reward(…, we",
+        ),
+        (
+            {"rewards": {"tilt": Reward(tilt, weight="much")}},
+            "task Cartpole: rewards.tilt.weight: expected a number, found",
+        ),  # type: ignore[arg-type]
         ({"rewards": {"tilt": Metric(tilt)}}, "task Cartpole: rewards.tilt: expected a Reward, found a Metric"),
-        ({"metrics": {"tilt": Metric(tilt, scal=2.0)}}, "task Cartpole: metrics.tilt: tilt: got an unexpected keyword argument 'scal'"),
-        ({"metrics": {"tilt": Metric(tilt, joints="hing")}}, "task Cartpole: metrics.tilt: no joint of robot matches 'hing'"),
-        ({"metrics": {"tilt": Metric(tilt, bodies="*")}}, "task Cartpole: metrics.tilt: tilt has no parameter bodies; leave"),
+        (
+            {"metrics": {"tilt": Metric(tilt, scal=2.0)}},
+            "task Cartpole: metrics.tilt: tilt: got an unexpected keyword argument 'scal'",
+        ),
+        (
+            {"metrics": {"tilt": Metric(tilt, joints="hing")}},
+            "task Cartpole: metrics.tilt: no joint of robot matches 'hing'",
+        ),
+        (
+            {"metrics": {"tilt": Metric(tilt, bodies="*")}},
+            "task Cartpole: metrics.tilt: tilt has no parameter bodies; leave",
+        ),
         ({"sensors": {"feet": ContactSensor}}, "task Cartpole: sensors.feet: "),
         ({"success": "tlt"}, "task Cartpole: success: no metric and no termination is called tlt"),
     ],
-)  # fmt: skip
+)
 def test_an_unknown_or_malformed_part_is_refused_in_one_line(parts: dict[str, Any], words: str) -> None:
     def sketch() -> Task:
         mine = Cartpole.with_(**parts)
@@ -165,9 +202,12 @@ def drafted(change: Callable[[Task], torch.Tensor]) -> type[Cartpole]:
     return Cartpole.with_(
         rewards={"tilt": Reward(change, weight=-0.5, per_second=True)},
         metrics={"draft": Metric(change, at_end=True)},
-        terminations={"leans": Termination(leans), "late": Termination(lambda task: task.episode_length < 0, time_out=True)},
+        terminations={
+            "leans": Termination(leans),
+            "late": Termination(lambda task: task.episode_length < 0, time_out=True),
+        },
         success="leans",
-    )  # fmt: skip
+    )
 
 
 def test_a_draft_in_torch_compiles_nothing_and_counts_as_any_term(compilations: list[str]) -> None:
