@@ -38,7 +38,7 @@ def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_pat
         assert told["class"] == where and told["rewards"] == dict(task.config_type().rewards)
         seen = task.observation_names
         if name == "CartpolePixels":
-            seen = ("image: 2 x RGB of 64 x 64 bytes, the present one first",)
+            seen = ("image: 2 x color of 64 x 64 bytes, the present one first",)
         assert tuple(told["observations"]) == seen and tuple(told["actions"]) == task.action_names
         assert told["control_hz"] == task.config_type().control_hz
     assert not (tmp_path / "home").exists(), "a listing needs no controller"
