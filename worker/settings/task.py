@@ -183,11 +183,11 @@ class _Common(metaclass=_InOneLine):
     """Randomisation of the worlds; none by default. A mapping of its fields is accepted."""
     curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({}))
     """Changes during training: ``[iteration, value]`` points in the order of the iterations, linearly interpolated and held constant
-    outside their range. Each is named after a reward term, whose weight it sets; the place of a number of a declared task, such as
+    outside their range. Each is named after a reward term, whose weight it sets; the place of a number of the task, such as
     ``events.push.speed`` (at a place with several numbers, it sets all); or ``level``, the difficulty of the task from 0 to 1 (of
     pushes and of the Quadruped's commands; a task of your own reads ``episodes.level``)."""
     numbers: Mapping[str, Finite | Sequence[Finite]] = field(default_factory=lambda: MappingProxyType({}))
-    """Numbers of a declared task by their place, such as ``rewards.track_linear.std``: ``muster tasks NAME`` lists them."""
+    """Numbers of the task by their place, such as ``rewards.track_linear.std``: ``muster tasks NAME`` lists them."""
     fastest: Positive = 1000.0
     """Joint velocity at which the physics counts as failed [m/s, rad/s]: the world is reset, as after a NaN."""
     nan_limit: Amount = 0.1

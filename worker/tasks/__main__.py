@@ -24,7 +24,7 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
 
     Args:
         name: As :func:`worker.tasks.find_task` takes it.
-        whole: For a declared task, include the tables of its terms and settings, the numbers that a job can change, and how
+        whole: Include the tables of its terms and settings, the numbers that a job can change, and how
             its configuration changes them during training.
 
     Raises:
