@@ -93,7 +93,7 @@ def test_a_replay_equals_the_launches(cartpole: Cartpole) -> None:
     addresses = cartpole.observations.data_ptr(), cartpole.rewards.data_ptr(), cartpole.statistics.data_ptr()
     replayed = play(cartpole, 60, seed=3)
     cartpole.load_state_dict(start)
-    replaying, cartpole._steps = cartpole._steps, [part for _, part in cartpole._parts()]
+    replaying, cartpole._steps = cartpole._steps, [part for _, part in cartpole._control.parts()]
     try:
         eager = play(cartpole, 60, seed=3)
     finally:
