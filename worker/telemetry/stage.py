@@ -61,7 +61,7 @@ class Stage:
         sketch = _seen(task_type).sketch(config)
         template = sketch.template
         self.worlds = worlds
-        views: list[RobotView] = list(getattr(sketch, "views", {}).values()) or [RobotView(template, "")]
+        views: list[RobotView] = list(sketch.views.values())
         self.joints, self.coordinates, self.dofs = [], [], []
         for view in views:
             own = "" if view.name in ("", "robot") else f"{view.name}/"
