@@ -1,4 +1,4 @@
-"""The results of terms written in torch, which kernels read from a table: adding or editing such a term compiles nothing."""
+"""The external results of terms written in torch, which kernels read from a table: adding or editing such a term compiles nothing."""
 
 from __future__ import annotations
 

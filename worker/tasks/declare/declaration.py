@@ -1,4 +1,4 @@
-"""The parts of a task: named terms for actions, observations, rewards, terminations, commands, events and curricula.
+"""The declaration of a task: named terms for actions, observations, rewards, terminations, commands, events and curricula.
 
 A term is a small Warp function with annotated parameters, see :mod:`worker.tasks.declare.functions`. Its numbers are data: a change
 compiles nothing, and a job's YAML sets them under ``train.config.numbers`` by their place, such as

@@ -1,4 +1,4 @@
-"""A task without worlds: its robots and objects, its terms bound to them, and the names that follow."""
+"""The sketch of a task, without worlds: its robots and objects, its terms bound to them, and the names that follow."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from worker.tasks.run.task_report import TaskReport
 from worker.tasks.run.variants import changed, changed_settings, check_parts
 
 
-class Sketch(TaskReport):
+class TaskSketch(TaskReport):
     """The part of :class:`worker.tasks.run.task.Task` that needs no worlds; a task overrides its methods up to :meth:`build`.
 
     Attributes:

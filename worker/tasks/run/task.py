@@ -30,12 +30,12 @@ from worker.tasks.run.buffers import Buffers
 from worker.tasks.run.control_step import ControlStep
 from worker.tasks.run.episode_records import LastEpisodes
 from worker.tasks.run.saved import check_state, completed
-from worker.tasks.run.sketch import Sketch
+from worker.tasks.run.sketch import TaskSketch
 from worker.tasks.run.task_checks import assert_replays, check_arguments
 from worker.tasks.terms.motion import RecordedMotion
 
 
-class Task(Sketch):
+class Task(TaskSketch):
     """A vector of Newton worlds that act, observe, are rewarded and reset themselves on the device.
 
     A subclass gives its robot and its declaration; the kernels are compiled from the terms::

@@ -1,4 +1,4 @@
-"""A task with other parts than the one that it extends: other terms, other defaults of its settings."""
+"""The variant of a task, with other parts than the one that it extends: other terms, other defaults of its settings."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from worker.settings.task import TaskConfig, default_rewards, reward_weights
 from worker.tasks.declare.declaration import Choice, Declaration, Image, Reward, a_type
 
 if TYPE_CHECKING:
-    from worker.tasks.run.sketch import Sketch
+    from worker.tasks.run.sketch import TaskSketch
 
 
-def check_parts(task: type[Sketch], parts: Mapping[str, Any]) -> None:
+def check_parts(task: type[TaskSketch], parts: Mapping[str, Any]) -> None:
     """Raise ValueError for a section that a declaration does not have, and for one that is no mapping of parts by name."""
     known = [item.name for item in dataclasses.fields(Declaration)]
     for section, part in parts.items():
@@ -75,7 +75,7 @@ def _merged(where: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> dict[
 
 
 def changed_settings(
-    task: type[Sketch], config: Mapping[str, Any], rewards: Mapping[str, Any], where: str = "config"
+    task: type[TaskSketch], config: Mapping[str, Any], rewards: Mapping[str, Any], where: str = "config"
 ) -> type[TaskConfig]:
     """The settings of a task with new defaults, and with new weights of rewards that the settings weigh.
 
