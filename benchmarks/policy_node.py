@@ -204,7 +204,7 @@ def measure(folder: Path) -> Measured:
 
     from muster_policy.messages import Messages
     from worker.deploy.simulated_robot import SimulatedRobot
-    from worker.tasks import DeclaredTask, find_task
+    from worker.tasks import Task, find_task
     from worker.tasks.run.policy_contract import policy_contract
 
     task_type = find_task("Go1Flat")
@@ -212,7 +212,7 @@ def measure(folder: Path) -> Measured:
     contract = policy_contract(task, "Go1Flat")
     groups = tuple(group for group in contract.groups if group.name == "policy")
     inputs = tuple(dataclasses.replace(group, input="obs") for group in groups)
-    assert isinstance(task, DeclaredTask)
+    assert isinstance(task, Task)
     robot = SimulatedRobot(task, dataclasses.replace(contract, groups=inputs), Messages())
     bundle = make_bundle(folder / "bundle", robot.contract)
     found: Measured = {}

@@ -42,9 +42,9 @@ from worker.simulation.sensors.imu import Imu
 from worker.simulation.sensors.momentum import AngularMomentum
 from worker.simulation.sensors.rays import LidarPattern, RayCaster
 from worker.tasks import find_task, terms
-from worker.tasks.compile.compiler import Kernels, further
+from worker.tasks.compile.compiler import Kernels
 from worker.tasks.declare.declaration import Declaration, Metric, Observation
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 WORLDS, WORLDS_CPU = 4096, 32
 TASKS = ("Ant", "Quadruped")
@@ -80,37 +80,36 @@ def eyes(task: str) -> dict[str, Any]:
     }
 
 
-def varied(task: str, change: Callable[[Declaration], Declaration]) -> type[DeclaredTask]:
+def varied(task: str, change: Callable[[Declaration], Declaration]) -> type[Task]:
     """The task with another declaration."""
     kind: Any = find_task(task)
     return type(f"{task}Varied", (kind,), {"declare": lambda self, config: change(kind.declare(self, config))})
 
 
-def made(kind: Any, worlds: int) -> DeclaredTask:
+def made(kind: Any, worlds: int) -> Task:
     """A task with random actions; Warp's messages about its modules are not shown."""
     with contextlib.redirect_stdout(io.StringIO()):
-        task: DeclaredTask = kind(kind.config_type(), worlds, seed=1, device=DEVICE)
+        task: Task = kind(kind.config_type(), worlds, seed=1, device=DEVICE)
     task.actions.uniform_(-1.0, 1.0)
     return task
 
 
-def parts(task: DeclaredTask) -> dict[str, Callable[[], None]]:
+def parts(task: Task) -> dict[str, Callable[[], None]]:
     """The launches of a control step besides the physics."""
-    rows = [array for group in further(task.plan) for array in task._rows[group]]
-    common = [int(STEP), task.max_episode_length, *rows, *task._common]
+    control = task._control
 
     def kernel(kernel: wp.Kernel, inputs: list[Any]) -> Callable[[], None]:
         return lambda: wp.launch(kernel, dim=task.world_count, inputs=inputs, device=task.device)
 
     return {
-        "actions": kernel(task._kernels.act, task._common),
-        "judge": kernel(task._kernels.judge, common),
-        "observe": lambda: task._observe_alone(int(STEP)),
+        "actions": kernel(control.kernels.act, control.common),
+        "judge": kernel(control.kernels.judge, control.inputs(int(STEP))),
+        "observe": lambda: control.observe(int(STEP)),
         "bodies": task.worlds.update_bodies,
     }
 
 
-def judged_and_observed(task: DeclaredTask) -> Callable[[], None]:
+def judged_and_observed(task: Task) -> Callable[[], None]:
     """The launches of a control step that hold terms."""
     own = parts(task)
 
@@ -132,14 +131,14 @@ def measured(sensor: Any) -> Callable[[], None]:
 
 
 @contextlib.contextmanager
-def unmeasured(sensed: DeclaredTask, plain: DeclaredTask) -> Iterator[None]:
+def unmeasured(sensed: Task, plain: Task) -> Iterator[None]:
     """In this context, a task runs only the sensors of the plain one."""
-    sensors, needs = sensed.sensors, sensed._needs
-    sensed.sensors, sensed._needs = {key: sensors[key] for key in plain.sensors}, plain._needs
+    sensors, needs = sensed.sensors, sensed._control.needs
+    sensed.sensors, sensed._control.needs = {key: sensors[key] for key in plain.sensors}, plain._control.needs
     try:
         yield
     finally:
-        sensed.sensors, sensed._needs = sensors, needs
+        sensed.sensors, sensed._control.needs = sensors, needs
 
 
 def seconds(graphs: Mapping[str, Callable[[], None]]) -> dict[str, list[float]]:
@@ -190,17 +189,17 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
     """Seconds of a control step and of its parts, of each sensor, of a term."""
     plain = made(find_task(name), worlds)
 
-    def with_sensors(added: dict[str, Any]) -> DeclaredTask:
+    def with_sensors(added: dict[str, Any]) -> Task:
         change = lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})  # noqa: E731
         return made(varied(name, change), worlds)
 
     added, looking = sensors(name), eyes(name)
     sensed, seeing = with_sensors(added), with_sensors(looking)
-    graphs: dict[str, Callable[[], None]] = {"step": CapturedStep(plain._whole, DEVICE).launch}
+    graphs: dict[str, Callable[[], None]] = {"step": CapturedStep(plain._control.whole, DEVICE).launch}
     # both on the same worlds, since the solver's work depends on their state
-    graphs["step, sensed"] = CapturedStep(sensed._whole, DEVICE).launch
+    graphs["step, sensed"] = CapturedStep(sensed._control.whole, DEVICE).launch
     with unmeasured(sensed, plain):
-        graphs["step, unmeasured"] = CapturedStep(sensed._whole, DEVICE).launch
+        graphs["step, unmeasured"] = CapturedStep(sensed._control.whole, DEVICE).launch
     graphs |= {part: copies(launch) for part, launch in parts(plain).items()}
     graphs |= {f"sensor {key}": copies(measured(sensed.sensors[key])) for key in added}
     graphs |= {f"sensor {key}": copies(measured(seeing.sensors[key])) for key in looking}
@@ -218,7 +217,7 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
         pairs = zip(found[f"term {term}"], found["term none"], strict=True)
         times[f"term {term}"] = statistics.median(more - less for more, less in pairs) / COPIES / MORE
     started = time.perf_counter()
-    Kernels(name, plain.plan, plain._needs.apart)
+    Kernels(plain.plan, plain._control.needs.apart)
     columns = {key: len(sensed.sensors[key].names) for key in added}
     return {"times": times, "text": time.perf_counter() - started, "columns": columns, "eyes": [*looking]}
 

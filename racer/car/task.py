@@ -45,11 +45,11 @@ from worker.tasks.declare.declaration import (
     Reward,
     Termination,
 )
-from worker.tasks.run.declared import DeclaredTask
 from worker.tasks.run.step_log import StepLog
+from worker.tasks.run.task import Task
 
 
-class Racer(DeclaredTask):
+class Racer(Task):
     """A car that sees the road ahead as numbers: 21 observations, 2 actions, 15 control steps a second, episodes of 60 s."""
 
     config_type = RacerConfig
@@ -67,7 +67,7 @@ class Racer(DeclaredTask):
         return Robot(CAR, passive=True)
 
     def build(self, builder: newton.ModelBuilder) -> None:
-        """As :meth:`DeclaredTask.build`, with the tracks around the car.
+        """As :meth:`Task.build`, with the tracks around the car.
 
         Raises:
             ValueError: A track, an action space or an obstacle is invalid.

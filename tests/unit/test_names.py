@@ -34,7 +34,7 @@ MODULES = {
 
 CLASSES = {
     "what a task declares, and the part of the policy contract that follows from it": "Action Image Term",
-    "an observation of a declared task, and one of a task with kernels of its own; both names are documented": "Observation",
+    "an observation that a task declares, and each of its numbers for a robot; both names are documented": "Observation",
     "a row of the database, and the same thing for those who use no database": "ComputeEnvironment Job Node",
     "a gang, for its engine and for its ranks": "Gang",
     "a section of the job YAML, and what is made of it": "MLflow Resources WandB",

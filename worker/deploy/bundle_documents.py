@@ -11,7 +11,7 @@ from shared_store.contract.error_text import shown
 from shared_store.contract.plugins import PluginError, load, plugins
 from shared_store.volume.bundles import CONTRACT, MANIFEST, REPORT
 from worker.settings.errors import UserError
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 if TYPE_CHECKING:
     from worker.tasks.run.task import Task
@@ -52,7 +52,7 @@ def bundle_documents(task: Task, algorithm: str) -> dict[str, Mapping[str, Any]]
 
 
 def _sources(task: Task, algorithm: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
-    if isinstance(task, DeclaredTask):
+    if isinstance(task, Task):
         yield f"task {type(task).__name__}: bundle_documents", task.bundle_documents(algorithm)
     for name, plugin in plugins().items():
         if plugin.bundle_parts:

@@ -19,7 +19,7 @@ def add_robot(task: Task, bundle: Path) -> dict[str, Any] | None:
     """Put the model of the task's robot into ``robot/`` of a bundle where its licence is known to allow that; returns what it is.
 
     Files of other packages and of users are named with their package and its licence, and not copied: meshes may have licences of
-    their own. None of a task of kernels by hand, which does not say what its robot is.
+    their own. None of a task without a robot.
     """
     declare = getattr(task, "robot", None)
     if declare is None:

@@ -26,7 +26,7 @@ from worker.settings.errors import UserError
 
 if TYPE_CHECKING:
     from muster_policy.messages import Messages
-    from worker.tasks.run.declared import DeclaredTask
+    from worker.tasks.run.task import Task
 
 Message = tuple[str, str, Any]
 """Topic, ROS type and message."""
@@ -45,7 +45,7 @@ class SimulatedRobot:
         messages: Types of a ROS distribution.
     """
 
-    def __init__(self, task: DeclaredTask, contract: Contract, messages: Messages) -> None:
+    def __init__(self, task: Task, contract: Contract, messages: Messages) -> None:
         self.task, self.contract, self.messages = task, contract, messages
         self._view = task.views["robot"]
         self._arrays = task.robots["robot"]
@@ -140,9 +140,9 @@ class SimulatedRobot:
 
         found: list[Message] = []
         described = {command.name: command for command in self.contract.commands}
-        for told in self.task.plan.commands:
-            command = described[told.bound.name]
-            memory = self.task.state_tensors()["memory"][0, told.first : told.first + len(command.names)]
+        for name, first in self.task.plan.binder.commands.items():
+            command = described[name]
+            memory = self.task.state_tensors()["memory"][0, first : first + len(command.names)]
             numbers = memory.double().tolist()
             if is_twist(command):
                 twist = self.messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))
@@ -265,7 +265,6 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
     """
     from worker.learning.setup import check_fit, check_robots
     from worker.tasks import find_task
-    from worker.tasks.run.declared import DeclaredTask
     from worker.tasks.run.policy_contract import policy_contract, same_policy
 
     try:
@@ -277,8 +276,6 @@ def open_robot(bundle: Path, messages: Messages, seed: int = 0, *, accept: bool 
     CHANGED_ROBOTS.set(accept)
     with user_errors():
         task = task_type(configure(task_type, manifest["train"]), 1, seed=seed, device="cpu")
-    if not isinstance(task, DeclaredTask) or "robot" not in task.views:
-        raise UserError(f"task {contract.task} declares no robot; a task of kernels by hand can't be a simulated robot")
     if task.discrete or any(action.rule or not action.scale for action in contract.actions):
         raise UserError(f"task {contract.task}: joint commands can't be turned back into its actions")
     now, of = same_policy(policy_contract(task, contract.task), contract), f"bundle {bundle}"

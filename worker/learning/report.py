@@ -23,7 +23,7 @@ from worker.learning.watch import HISTORY, Watch
 if TYPE_CHECKING:
     from worker.learning.loop import Loop
     from worker.learning.training import Training
-    from worker.tasks.run.task_report import Telling
+    from worker.tasks.run.task_report import TaskReport
 
 
 class Stopwatch:
@@ -278,7 +278,7 @@ class Failures:
         say: Writes a line to the log.
     """
 
-    def __init__(self, task: Telling, say: Callable[[str], None]) -> None:
+    def __init__(self, task: TaskReport, say: Callable[[str], None]) -> None:
         self._task, self._say = task, say
         self._reported: set[str] = set()
 

@@ -27,7 +27,7 @@ from worker.settings.errors import UserError
 from worker.simulation.robot_values import shown_value
 from worker.tasks.run.adapting import begin_evaluation
 from worker.tasks.run.mistakes import task_mistakes
-from worker.tasks.run.policy_contract import policy_contract, readings_of, robots_of, same_policy
+from worker.tasks.run.policy_contract import policy_contract, robots_of, same_policy
 
 if TYPE_CHECKING:
     from worker.learning.training import Training
@@ -216,7 +216,7 @@ def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) ->
         lines = robot_changes(then.robots, robots_of(task))
     else:
         lines = []
-        for name, reading in readings_of(task).items():
+        for name, reading in task.readings.items():
             if found := [each for each in reading.corrected if not each.is_rounding]:
                 first, more = found[0], f" ({len(found) - 1} more)" if len(found) > 1 else ""
                 was, is_now = shown_value(first.built), shown_value(first.file)

@@ -142,7 +142,7 @@ def value_at(points: Sequence[Sequence[float]], iteration: int) -> float:
 
 
 def reward_weights(**weights: float) -> Any:
-    """The ``rewards`` field of a task's configuration: its terms in the order of the kernel's indices, with their weights.
+    """The ``rewards`` field of a task's configuration, for weights that a submission checks: the terms in their order.
 
     Args:
         **weights: Default weight of each term; that of a cost is negative.
@@ -151,7 +151,7 @@ def reward_weights(**weights: float) -> Any:
 
 
 def default_rewards(config_type: type[TaskConfig]) -> Mapping[str, float]:
-    """Terms and weights as ``config_type`` defines them, in the order of the kernel's indices."""
+    """Terms and weights as ``config_type`` defines them, in their order."""
     factory: Any = next(item.default_factory for item in fields(config_type) if item.name == "rewards")
     weights: Mapping[str, float] = factory()
     return weights
@@ -178,16 +178,16 @@ class _Common(metaclass=_InOneLine):
     episode_seconds: Positive = 10.0
     """Simulated time after which the clock ends an episode [s]."""
     rewards: Mapping[str, Finite] = reward_weights()
-    """Weight of each reward term. Terms that are not named keep the task's defaults."""
+    """Weight of each reward term, in place of the one beside the term. Terms that are not named keep the task's."""
     randomize: Annotated[Randomization, from_mapping(Randomization)] = Randomization()
     """Randomisation of the worlds; none by default. A mapping of its fields is accepted."""
     curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({}))
     """Changes during training: ``[iteration, value]`` points in the order of the iterations, linearly interpolated and held constant
-    outside their range. Each is named after a reward term, whose weight it sets; the place of a number of a declared task, such as
+    outside their range. Each is named after a reward term, whose weight it sets; the place of a number of the task, such as
     ``events.push.speed`` (at a place with several numbers, it sets all); or ``level``, the difficulty of the task from 0 to 1 (of
     pushes and of the Quadruped's commands; a task of your own reads ``episodes.level``)."""
     numbers: Mapping[str, Finite | Sequence[Finite]] = field(default_factory=lambda: MappingProxyType({}))
-    """Numbers of a declared task by their place, such as ``rewards.track_linear.std``: ``muster tasks NAME`` lists them."""
+    """Numbers of the task by their place, such as ``rewards.track_linear.std``: ``muster tasks NAME`` lists them."""
     fastest: Positive = 1000.0
     """Joint velocity at which the physics counts as failed [m/s, rad/s]: the world is reset, as after a NaN."""
     nan_limit: Amount = 0.1
@@ -204,8 +204,7 @@ class TaskConfig(_Common):
     from a job's YAML.
 
     Raises:
-        ValueError: A value has the wrong type or is out of range, or ``rewards`` or ``curriculum`` names a term that the task does
-            not have.
+        ValueError: A value has the wrong type or is out of range.
     """
 
     further_groups: ClassVar[Mapping[str, bool]] = MappingProxyType({})
@@ -220,11 +219,23 @@ class TaskConfig(_Common):
 
     @classmethod
     def problem_with(cls, overrides: Mapping[str, Any]) -> tuple[tuple[str | int, ...], str] | None:
-        """The error in a job's ``train.config``: the keys to the value, and one line; None: it is valid."""
+        """The error in a job's ``train.config``: the keys to the value, and one line; None: it is valid.
+
+        Only this checks names of terms; without it, the task does, which may have others besides.
+        """
         try:
-            cls.configured(overrides)
+            config = cls.configured(overrides)
         except Refused as error:
             return error.path, error.words
+        known = config.default_weights
+        for name in config.rewards:
+            if known and name not in known:
+                return ("rewards", name), f"the task has no term {shown(name)}; {nearest(name, known)}"
+        for name in config.curriculum:
+            if (
+                known and name != "level" and name not in known and "." not in name
+            ):  # only the built task has the places
+                return ("curriculum", name), f"there is no such term; {nearest(name, ['level', *known])}"
         return None
 
     @classmethod
@@ -266,6 +277,11 @@ class TaskConfig(_Common):
         return []
 
     @property
+    def default_weights(self) -> Mapping[str, float]:
+        """The weights that the settings name, in their order."""
+        return self.other_rewards if self.has_other_rewards else default_rewards(type(self))
+
+    @property
     def has_other_rewards(self) -> bool:
         """Whether :attr:`other_rewards` are the task's reward terms; no, by default."""
         return False
@@ -300,7 +316,7 @@ class TaskConfig(_Common):
             ("rewards", {term: {"type": "number", "default": weight} for term, weight in known.items()}),
             ("curriculum", dict.fromkeys(("level", *known), points)),
         ):
-            properties[name] = {"type": "object", "properties": terms, "additionalProperties": False}
+            properties[name] = {"type": "object", "properties": terms, "additionalProperties": not known}
         return document
 
     def __post_init__(self) -> None:
@@ -308,28 +324,17 @@ class TaskConfig(_Common):
         checked = _Common(**{item.name: getattr(self, item.name) for item in fields(_Common)})
         for item in fields(_Common):
             object.__setattr__(self, item.name, getattr(checked, item.name))
-        known = default_rewards(type(self))
-        if self.has_other_rewards:
-            if self.rewards == known:  # none were given
-                object.__setattr__(self, "rewards", self.other_rewards)
-            known = self.other_rewards
-        for name in self.rewards:
-            if name not in known:
-                raise Refused(
-                    ("rewards", name), f"{type(self).__name__} has no term {shown(name)}; {nearest(name, known)}"
-                )
-        for name, points in self.curriculum.items():
-            # only the built task has the places
-            if name != "level" and name not in known and "." not in name:
-                raise Refused(("curriculum", name), f"there is no such term; {nearest(name, ['level', *known])}")
-            if name == "level" and not all(0.0 <= value <= 1.0 for _, value in points):
-                raise Refused(("curriculum", "level"), f"expected levels from 0 to 1, found {shown(points)}")
+        known = self.default_weights
+        given = {} if self.rewards == default_rewards(type(self)) else self.rewards  # none were given
+        points = self.curriculum.get("level", ())
+        if not all(0.0 <= value <= 1.0 for _, value in points):
+            raise Refused(("curriculum", "level"), f"expected levels from 0 to 1, found {shown(points)}")
         groups, scene = self.observation_groups, self.randomize.scene
         if scene and not any(groups.values()):
             raise Refused(("randomize", scene[0]), f"{type(self).__name__} has no camera that would see it")
         if self.randomize.observation_noise and groups["policy"]:
             raise Refused(("randomize", "observation_noise"), "it is for numbers, not for images; use light and colors")
-        weights = {name: float(self.rewards.get(name, weight)) for name, weight in known.items()}
+        weights = {name: float(weight) for name, weight in {**known, **given}.items()}
         object.__setattr__(self, "rewards", MappingProxyType(weights))
         object.__setattr__(self, "curriculum", MappingProxyType(dict(self.curriculum)))
         object.__setattr__(self, "numbers", MappingProxyType(dict(self.numbers)))

@@ -69,6 +69,7 @@ QUANTITIES: Mapping[str, Quantity] = {
     "friction": Quantity(
         "geoms", "1, m, m", "coefficients of friction of a geom", ("slide", "torsion", "roll"), ("slide",)
     ),
+    "contact_friction": Quantity("geoms", "1", "all coefficients of friction of a geom", operations=("scale",)),
     "armature": Quantity("joints", "kg m^2, kg", "inertia of a joint's rotor"),
     "joint_damping": Quantity("joints", "N m s/rad, N s/m", "passive damping of a joint"),
     "joint_friction": Quantity(
@@ -87,7 +88,14 @@ QUANTITIES: Mapping[str, Quantity] = {
     "damping": Quantity("actuators", "N m s/rad, N s/m", "gain on the velocity of a position or velocity actuator"),
     "effort_limit": Quantity("actuators", "N m, N", "greatest force of an actuator"),
     "motor_strength": Quantity("actuators", "1", "all that an actuator's force is made of", operations=("scale",)),
-    "gravity": Quantity("", "m/s^2", "acceleration of free fall, in the world frame", _XYZ, ("z",), signed=True),
+    "gravity": Quantity(
+        "",
+        "m/s^2",
+        "acceleration of free fall, in the world frame; a factor without axes scales it all",
+        _XYZ,
+        ("z",),
+        signed=True,
+    ),
 }
 """The quantities of :class:`Randomize`, by name."""
 
@@ -133,7 +141,7 @@ class Randomize:
     at: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of a payload in the body's frame [m]."""
     robot: str | None = "robot"
-    """Robot or object with these parts; None, only for geoms: any geom of a world, including the ground."""
+    """Robot or object with these parts; None: all that have such parts, and with geoms the ground."""
 
     def __post_init__(self) -> None:
         if self.what not in QUANTITIES:
@@ -214,8 +222,6 @@ class Randomize:
                 raise ValueError(f"{self._where}: {parts}={getattr(self, parts)!r} does not fit; {instead}")
         if expected and not getattr(self, expected):
             raise ValueError(f'{self._where}: {expected} is required; all of them are {expected}="*"')
-        if self.robot is None and expected not in ("geoms", ""):
-            raise ValueError(f"{self._where}: {expected} belong to a robot; name it, such as robot='robot'")
 
     def _check_range(self, ends: Ends) -> None:
         shown = f"{self._where}: the range {ends!r}"

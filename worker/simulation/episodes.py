@@ -1,7 +1,7 @@
 """Episodes of many worlds: ages, sums, termination, statistics and random streams, as functions that kernels call.
 
-A task's ``observe`` kernel runs one thread a world and calls, in this order, :func:`add_reward` for every term,
-:func:`end_step`, and, where that says so, :func:`begin_episode` and its own code that places the world afresh.
+The generated kernel that ends a step runs one thread a world and calls :func:`add_reward` for every term, :func:`end_step`, and, where that
+says so, :func:`begin_episode` and the events of a reset.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 STEP = wp.constant(0)
-"""Mode of an ``observe`` kernel: reward, termination and reset of the worlds that ended."""
+"""Mode of a step's end: reward, termination and reset of the worlds that ended."""
 RESET = wp.constant(1)
-"""Mode of an ``observe`` kernel: begin a new episode in every world, without reward or statistics."""
+"""Mode of a reset: begin a new episode in every world, without reward or statistics."""
 
 ACTION_LIMIT = wp.constant(1.0)
 """Actions are clipped to plus and minus this."""
@@ -28,7 +28,7 @@ TERMS = wp.constant(2)
 TIME_OUT = wp.constant(0)
 PHYSICS_FAILED = wp.constant(1)
 TERMINATED = wp.constant(2)
-"""Cause of an episode's end, in ``EpisodeArrays.causes``: the clock, a physics failure, or the task. In a declared task the first
+"""Cause of an episode's end, in ``EpisodeArrays.causes``: the clock, a physics failure, or the task: the first
 termination is ``TERMINATED + 1``, the second ``TERMINATED + 2``, …"""
 WATCHED = 16
 """Number of worlds, from the first, whose reward terms are kept every step for telemetry."""
@@ -54,7 +54,7 @@ class EpisodeArrays:
         level: Present difficulty from the curriculum, from 0 to 1 (1 without a curriculum), shape ``(1,)``.
         memory: The task's own state between steps, zero when an episode begins, shape ``(worlds, memory_size)``.
         lasting: The task's own state of each world across episodes, shape ``(worlds, lasting_size)``.
-        last_actions: The actions of the step before while a declared task rewards, those that led here when it observes, 0 when an
+        last_actions: The actions of the step before while the task rewards, those that led here when it observes, 0 when an
             episode begins; shape ``(worlds, actions)``.
         earlier_actions: Those of one step earlier; shape ``(worlds, actions)``.
         warm_start: Accelerations of the worlds from which the constraint solver starts, shape ``(worlds, dofs)``.
@@ -66,10 +66,10 @@ class EpisodeArrays:
             :data:`NO_MISHAP`; shape ``(1,)``.
         last_sums: The ``sums`` of the world's last episode that ended, shape ``(worlds, 2 + terms)``.
         causes: Why that episode ended, see :data:`TERMINATED`; shape ``(worlds,)``.
-        successes: Whether the last step was a success, if a declared task defines success; shape ``(worlds,)``.
+        successes: Whether the last step was a success, if the task defines success; shape ``(worlds,)``.
         statistics: Running totals since they were cleared: finished episodes, their returns, their steps, one total
-            a reward term and metric, worlds reset because of NaN, control steps with a solver overflow, the squares of the returns, of a
-            declared task the ends by each termination and by the clock; shape ``(6 + terms,)`` or more.
+            a reward term and metric, worlds reset because of NaN, control steps with a solver overflow, the squares of the returns, the
+            ends by each termination and by the clock; shape ``(6 + terms,)`` or more.
     """
 
     actions: wp.array2d[wp.float32]

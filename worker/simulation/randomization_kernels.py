@@ -17,7 +17,7 @@ STARTUP, RESET, INTERVAL = 0, 1, 2
 MASS, CENTER, INERTIA, PAYLOAD = 0, 1, 2, 3
 """Properties of a body that a change can affect."""
 
-FIRST_STREAM = wp.constant(-200)
+FIRST_STREAM = -200
 """Number of the stream from which a world's first entry is drawn at startup; each further entry uses the next lower number."""
 LEAST_MASS = wp.constant(0.01)
 """Least fraction of its mass that a body keeps, whatever is drawn."""
@@ -39,6 +39,7 @@ class Entries:
         first_ranges: Its first row in ``ranges``, shape ``(entries,)``.
         distributions: See :data:`UNIFORM`, shape ``(entries,)``.
         moments: See :data:`STARTUP`, shape ``(entries,)``.
+        streams: Number of the stream from which it is drawn at startup, shape ``(entries,)``.
         ranges: Least and greatest number, or mean and standard deviation, shape ``(ranges,)``.
         seconds: Least and greatest time between the draws of an interval [s], shape ``(entries,)``.
         control_hz: Control steps per simulated second [Hz].
@@ -50,6 +51,7 @@ class Entries:
     first_ranges: wp.array[wp.int32]
     distributions: wp.array[wp.int32]
     moments: wp.array[wp.int32]
+    streams: wp.array[wp.int32]
     ranges: wp.array[wp.vec2]
     seconds: wp.array[wp.vec2]
     control_hz: float
@@ -145,7 +147,7 @@ def draw_at_start(
 ):
     """Draw one entry of one world. Each has a stream of its own: what one is does not depend on what else is drawn."""
     world, entry = wp.tid()
-    stream = _draw_entry(entries, world, entry, numbered_stream(episodes, world, FIRST_STREAM - entry), draws)
+    stream = _draw_entry(entries, world, entry, numbered_stream(episodes, world, entries.streams[entry]), draws)
     if entries.moments[entry] == _INTERVAL:
         _draw_countdown(entries, world, entry, stream, countdowns)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from typing import Any
 
 import mujoco
@@ -79,18 +81,17 @@ def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]
         ValueError: The robot is unknown, a pattern matches nothing, or a part has no such property.
     """
     if entry.what == "gravity":
-        axes = [entry.quantity.axes.index(axis) for axis in entry.drawn_axes]
-        changes = (
-            Change(array, column, 0, index) for array in ("opt.gravity", "gravity") for index, column in enumerate(axes)
-        )
+        axes = [(entry.quantity.axes.index(axis), index) for index, axis in enumerate(entry.drawn_axes)]
+        if entry.operation == "scale" and not entry.axes and not isinstance(entry.range, Mapping):
+            axes = [(axis, 0) for axis in range(3)]
+        changes = (Change(array, column, 0, index) for array in ("opt.gravity", "gravity") for column, index in axes)
         return EntryTargets(("gravity",), tuple(changes))
     if entry.robot is None:
-        shapes = [label for label in worlds.model.shape_label]
-        one_world = _shapes_of_a_world(worlds)
-        names = [shapes[shape].rpartition("/")[2] for shape in one_world]
-        chosen = find(names, entry.pattern or "*", "geom of the worlds")
-        return _geoms(entry, worlds, [names[index] for index in chosen], [one_world[index] for index in chosen])
-    view, chosen = _parts(entry, entry.robot, views)
+        return _of_all_robots(entry, worlds, views)
+    return _of_robot(entry, worlds, *_parts(entry, entry.robot, views))
+
+
+def _of_robot(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> EntryTargets:
     parts = entry.quantity.parts
     if parts == "bodies":
         return _bodies(entry, worlds, view, chosen)
@@ -100,6 +101,31 @@ def find_target(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]
     if parts == "joints":
         return _joints(entry, worlds, view, chosen)
     return _actuators(entry, worlds, view, chosen)
+
+
+def _of_all_robots(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotView]) -> EntryTargets:
+    """The targets in all robots and objects, without bodies that have no mass and joints that nothing drives."""
+    parts, pattern = entry.quantity.parts, entry.pattern or "*"
+    if parts == "geoms":
+        one_world = _shapes_of_a_world(worlds)
+        names = [worlds.model.shape_label[shape].rpartition("/")[2] for shape in one_world]
+        chosen = find(names, pattern, "geom of the worlds")
+        return _geoms(entry, worlds, [names[index] for index in chosen], [one_world[index] for index in chosen])
+    masses, found = worlds.model.body_mass.numpy(), EntryTargets((), ())
+    patterns = [pattern] if isinstance(pattern, str) else pattern
+    for view in views.values():
+        names = view.body_names if parts == "bodies" else view.joint_names
+        there = [index for index, name in enumerate(names) if any(fnmatchcase(name, each) for each in patterns)]
+        if parts == "bodies":
+            there = [body for body in there if masses[view.bodies[body]] > 0.0]
+        elif parts == "actuators":
+            there = [joint for joint in there if view.actuators[joint] >= 0]
+        own = _of_robot(entry, worlds, view, there)
+        changes = (dataclasses.replace(each, element=each.element + len(found.names)) for each in own.changes)
+        found = EntryTargets((*found.names, *own.names), (*found.changes, *changes))
+    if not found.names:
+        raise ValueError(f"no robot or object has {parts} that fit {pattern!r} and have a {entry.what}")
+    return found
 
 
 def check_patterns(entries: Mapping[str, Randomize], views: Mapping[str, RobotView]) -> None:
@@ -167,14 +193,16 @@ def _bodies(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]
 
 def _geoms(entry: Randomize, worlds: Worlds, names: list[str], shapes: list[int]) -> EntryTargets:
     columns = _columns(worlds.solver.mjc_geom_to_newton_shape.numpy()[0])
-    axes = [entry.quantity.axes.index(axis) for axis in entry.drawn_axes]
+    axes = [(entry.quantity.axes.index(axis), number) for number, axis in enumerate(entry.drawn_axes)]
+    if entry.what == "contact_friction":
+        axes = [(axis, 0) for axis in range(3)]
     there = [(name, columns[shape]) for name, shape in zip(names, shapes, strict=True) if shape in columns]
     if not there:
         raise ValueError(f"geoms {', '.join(names)} touch nothing, so they have no friction; choose geoms that collide")
     changes = (
         Change("geom_friction", 3 * geom + axis, element, number, least=LEAST_FRICTION)
         for element, (_, geom) in enumerate(there)
-        for number, axis in enumerate(axes)
+        for axis, number in axes
     )
     return EntryTargets(tuple(name for name, _ in there), tuple(changes))
 

@@ -18,6 +18,7 @@ from worker.simulation.declared_randomization import DISTRIBUTIONS, MOMENTS, OPE
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.inverse_weights import InverseWeights
 from worker.simulation.randomization_kernels import (
+    FIRST_STREAM,
     STARTUP,
     Bodies,
     BodyFields,
@@ -46,7 +47,7 @@ class _Drawn:
 class Randomizations:
     """All declared randomisations of a task: launches only, on arrays with fixed addresses.
 
-    Construct it while the model holds its original values (after a ``Randomizer``, whose factors count as original) and before a capture.
+    Construct it while the model holds its original values, and before a capture.
     It draws and applies every entry at once, so entries of resets and intervals have a value from the start.
 
     Of a step, :meth:`settle` costs one launch for the draws, one for each array that entries of resets and intervals change, and
@@ -60,6 +61,7 @@ class Randomizations:
         views: Robots and objects by name.
         robots: Their arrays by name, for the encoders' bias.
         control_hz: Control steps per simulated second [Hz].
+        streams: Numbers of the streams of some entries at startup, by name; those of others follow from their order.
 
     Raises:
         ValueError: An entry names an unknown robot, a pattern without a match, or a part without such a property.
@@ -77,6 +79,7 @@ class Randomizations:
         views: Mapping[str, RobotView],
         robots: Mapping[str, RobotArrays],
         control_hz: float,
+        streams: Mapping[str, int] | None = None,
     ) -> None:
         self._worlds, self._episodes = worlds, episodes
         self._device = worlds.model.device
@@ -88,7 +91,7 @@ class Randomizations:
                 targets[name] = find_target(entry, worlds, views)
             except ValueError as error:
                 raise ValueError(f"randomize.{name}: {error}") from error
-        self._list_entries(targets, control_hz)
+        self._list_entries(targets, control_hz, streams or {})
         draws = wp.zeros((count, len(self.names)), dtype=wp.float32, device=self._device)
         countdowns = wp.zeros((count, len(self._entries)), dtype=wp.int32, device=self._device)
         self._draws, self._countdowns = draws, countdowns
@@ -155,7 +158,7 @@ class Randomizations:
                 found[f"{name}.seconds"] = seconds[index]
         return found
 
-    def _list_entries(self, targets: Mapping[str, EntryTargets], control_hz: float) -> None:
+    def _list_entries(self, targets: Mapping[str, EntryTargets], control_hz: float, streams: Mapping[str, int]) -> None:
         """Give every drawn number a column, and every entry its row in the tables."""
         self.names: list[str] = []
         self._first_columns: list[int] = []
@@ -179,6 +182,7 @@ class Randomizations:
             "first_ranges": self._first_ranges,
             "distributions": [DISTRIBUTIONS.index(entry.distribution) for entry in every],
             "moments": [MOMENTS.index(entry.when) for entry in every],
+            "streams": [streams.get(name, FIRST_STREAM - index) for index, name in enumerate(self._entries)],
         }.items():
             setattr(table, field, wp.array(values, dtype=wp.int32, device=self._device))
         table.ranges = _pairs(ranges, self._device)

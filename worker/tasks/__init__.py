@@ -1,6 +1,6 @@
 """Tasks: find one by name, and the public parts of a task of your own.
 
-The names here are public: ``from worker.tasks import DeclaredTask, Declaration, Robot, terms``. Each is imported on first use,
+The names here are public: ``from worker.tasks import Task, Declaration, Robot, terms``. Each is imported on first use,
 because most of them import the simulation.
 """
 
@@ -31,7 +31,6 @@ _PUBLIC = {
         ),
         "Termination",
     ),
-    "worker.tasks.run.declared": ("DeclaredTask",),
     "worker.simulation.declared_randomization": ("Randomize",),
     "worker.tasks.run.task": ("Task",),
     "worker.tasks.declare.term_needs": ("needs",),
@@ -65,6 +64,8 @@ _MODULE_OF = {name: module for module, names in _PUBLIC.items() for name in name
 
 
 def __getattr__(name: str) -> Any:
+    if name == "DeclaredTask":  # its former name
+        name = "Task"
     if name == "terms":
         return importlib.import_module("worker.tasks.terms")
     if name not in _MODULE_OF:

@@ -24,7 +24,7 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
 
     Args:
         name: As :func:`worker.tasks.find_task` takes it.
-        whole: For a declared task, include the tables of its terms and settings, the numbers that a job can change, and how
+        whole: Include the tables of its terms and settings, the numbers that a job can change, and how
             its configuration changes them during training.
 
     Raises:
@@ -34,19 +34,17 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
     with task_mistakes(name):
         config = kind.config_type()
         task = kind.sketch(config)
-    plan = getattr(task, "plan", None)
     return {
         "name": name,
         "class": f"{kind.__module__}:{kind.__qualname__}",
         "about": (kind.__doc__ or "").strip().partition("\n")[0],
-        "observations": _observations(task, config),
+        "observations": _observations(task),
         "actions": list(task.action_names),
-        "rewards": dict(config.rewards),
+        "rewards": task.plan.weights,
         "control_hz": config.control_hz,
         "substeps": config.substeps,
         "episode_seconds": config.episode_seconds,
-        **(_whole(plan) if whole and plan else {}),
-        **({"robots": _robots(task)} if whole else {}),
+        **({**_whole(task.plan), "robots": _robots(task)} if whole else {}),
     }
 
 
@@ -63,13 +61,9 @@ def _whole(plan: KernelPlan) -> dict[str, Any]:
     return {"tables": tables(plan), "numbers": numbers(plan), "curriculum": curriculum}
 
 
-def _observations(task: Task, config: Any) -> list[str]:
+def _observations(task: Task) -> list[str]:
     """Name of each observation; for each camera, one line that describes its image."""
-    camera = getattr(config, "camera", None)
-    if camera is not None:
-        return [f"image: {camera.frames} x RGB of {camera.width} x {camera.height} bytes, the present one first"]
-    plan = getattr(task, "plan", None)
-    images = {group: shown(plan, group) for group in plan.images} if plan else {}
+    images = {group: shown(task.plan, group) for group in task.plan.images}
     names = [] if "policy" in images else list(task.observation_names)
     return names + [f"{'image' if group == 'policy' else group}: {words}" for group, words in images.items()]
 

@@ -21,7 +21,7 @@ from newton.sensors import SensorCamera
 
 from worker.settings.errors import UserError
 from worker.simulation.on_host import numbers
-from worker.simulation.world_cameras import look
+from worker.simulation.rendering import look
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Tap, TapReader
 

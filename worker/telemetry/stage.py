@@ -21,7 +21,7 @@ from worker.simulation.carriers import is_carrier
 from worker.simulation.on_host import numbers
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 if TYPE_CHECKING:
     from worker.settings.task import TaskConfig
@@ -61,7 +61,7 @@ class Stage:
         sketch = _seen(task_type).sketch(config)
         template = sketch.template
         self.worlds = worlds
-        views: list[RobotView] = list(getattr(sketch, "views", {}).values()) or [RobotView(template, "")]
+        views: list[RobotView] = list(sketch.views.values())
         self.joints, self.coordinates, self.dofs = [], [], []
         for view in views:
             own = "" if view.name in ("", "robot") else f"{view.name}/"
@@ -148,8 +148,6 @@ class Stage:
 
 def _seen(task_type: type[Task]) -> type[Task]:
     """The task, with the geoms of its robots that are only seen."""
-    if not issubclass(task_type, DeclaredTask):
-        return task_type
 
     def robot(self: Any, config: Any) -> Any:
         return _with_visuals(task_type.robot(self, config))
@@ -162,7 +160,7 @@ def _seen(task_type: type[Task]) -> type[Task]:
 
 def _robot_file(sketch: Task, config: TaskConfig) -> tuple[str, str] | None:
     """Name and text of the robot's file; None where it is binary, or the task has no such file."""
-    file = getattr(sketch.robot(config), "file", None) if isinstance(sketch, DeclaredTask) else None
+    file = getattr(sketch.robot(config), "file", None)
     if file is None:
         return None
     found = robot_files.read(file)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import ast
 import math
 import re
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -20,12 +22,12 @@ from tests.support.worker.tasks import observe, put
 from worker.learning.job import configure
 from worker.settings.velocity import Go1FlatConfig
 from worker.tasks import find_task
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 SIZES = re.compile(r"(\d+) observations, (\d+) actions?")
 
 
-def played(task: DeclaredTask, steps: int = 3) -> DeclaredTask:
+def played(task: Task, steps: int = 3) -> Task:
     """A task after some random steps, whose sizes are those of its docstring."""
     generator = torch.Generator().manual_seed(1)
     for _ in range(steps):
@@ -37,36 +39,71 @@ def played(task: DeclaredTask, steps: int = 3) -> DeclaredTask:
 
 
 def test_the_tutorial_shows_the_example_as_it_is() -> None:
-    example = (REPOSITORY / "job_specs/my_task.py").read_text()
-    shown = blocks("own-task.md")[:5]
-    assert "".join("".join(shown).split()) == "".join(example.split('"""', 2)[2].split())
+    example = (REPOSITORY / "job_specs/my_task.py").read_text().split('"""', 2)[2].strip()
+    assert example in (block.strip() for block in blocks("own-task.md"))
 
 
-def test_the_page_on_kernels_shows_the_example_as_it_is() -> None:
-    example = (REPOSITORY / "job_specs/my_kernels.py").read_text()
-    shown = [block.rstrip() for block in blocks("tasks/kernels.md")]
-    missing = [block for block in shown if "@wp." in block and block not in example]
-    assert not missing and sum("@wp." in block for block in shown) == 4
+def test_a_reward_is_added_to_g1_in_eight_lines_and_drafted_in_torch(tmp_path: Path) -> None:
+    need_mjlab()
+    assert len([line for line in blocks("own-task.md")[0].splitlines() if line.strip()]) == 8
+    page = module("own-task.md", tmp_path)
+    tasks = [played(kind(kind.config_type(), 2, seed=1)) for kind in (page.Mine, page.Draft)]
+    sums = [task.state_dict()["episode_sums"][:, 2 + task.reward_terms.index("feet_flat")] for task in tasks]
+    assert (sums[0] < 0.0).all() and torch.allclose(*sums, rtol=1e-4)
+    calm = page.Calm.sketch(page.Calm.config_type())
+    assert "air_time" not in calm.reward_terms and calm.config.episode_seconds == 10.0
+    assert calm.config.ppo.learning_rate == 5e-4 and "push_robot" not in calm.declaration.events
+
+
+def test_mjlabs_side_of_the_tutorial_names_what_mjlab_has() -> None:
+    """Its own packages are not installed here, so that it can't run: names and keywords are judged by its source."""
+    need_mjlab()
+    root = Path(str(metadata.distribution("mjlab").locate_file("")))
+
+    def names(module: str) -> dict[str, ast.stmt]:
+        path = root / module.replace(".", "/")
+        path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        found: dict[str, ast.stmt] = {}
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                found[node.name] = node
+            elif isinstance(node, ast.ImportFrom):
+                found |= {each.asname or each.name: node for each in node.names}
+                if any(each.name == "*" for each in node.names):
+                    found |= names(f"{module}.{node.module}" if node.level else f"{node.module}")
+        return found
+
+    imported, used = 0, set[str]()
+    for node in ast.walk(ast.parse("".join(blocks("own-task.md", "python mjlab")))):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("mjlab"):
+            known = names(str(node.module)) | dict.fromkeys(("mdp",), node)
+            assert [each.name for each in node.names if each.name not in known] == [], node.module
+            imported += len(node.names)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "mdp":
+            used.add(node.attr)
+    assert imported > 15 and used - names("mjlab.envs.mdp").keys() == set()
 
 
 def test_the_tutorials_further_tasks_run(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
-    task = played(page.Everything(page.PendulumConfig(), 3, seed=1), 40)
+    task = played(page.Everything(page.Everything.config_type(), 3, seed=1), 40)
     assert task.groups["policy"].shape == (3, 6) and task.groups["critic"].shape == (3, 8)
     assert {"metric_power", "termination_spins", "termination_bored"} <= set(task.statistic_names)
     angle, velocity = task.worlds.state.joint_q.numpy(), task.worlds.state.joint_qd.numpy()
     energy = 0.5 * (-9.81 * 0.25) * math.cos(angle[1]) + 0.5 * 0.25 / 6.0 * velocity[1] ** 2
     assert task.groups["critic"][1, 7].item() == pytest.approx(0.2 * energy, rel=1e-4)
     assert "wanted: 1 x (rad - 0)" in page.contract(task)
-    assert page.Chooser.sketch(page.PendulumConfig()).action_names == ("left", "none", "right")
-    assert page.CheckedConfig(torque=0.5).torque == 0.5
+    assert page.Chooser.sketch(page.Chooser.config_type()).action_names == ("left", "none", "right")
+    assert page.Judged.sketch(page.Judged.config_type()).success == "still"
+    torqued = page.Torqued.sketch(page.TorquedConfig(torque=0.5))
+    assert torqued.plan.numbers.values[torqued.plan.numbers.places["actions.torque.scale"][0]] == 0.5
     with pytest.raises(ValueError, match="torque"):
-        page.CheckedConfig(torque=2.0)
+        page.TorquedConfig(torque=2.0)
 
 
 def test_a_cube_beside_the_pendulum_falls_onto_the_ground(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
-    task = played(page.WithCube(page.PendulumConfig(), 2, seed=1), 30)
+    task = played(page.WithCube(page.WithCube.config_type(), 2, seed=1), 30)
     assert task.observation_names[-1] == "cube"
     assert task.observations[:, 3].tolist() == pytest.approx([0.05, 0.05], abs=3e-3)
 
@@ -74,6 +111,7 @@ def test_a_cube_beside_the_pendulum_falls_onto_the_ground(tmp_path: Path) -> Non
 def test_the_tutorials_jobs_fit_the_example() -> None:
     page = (REPOSITORY / "docs/own-task.md").read_text()
     jobs = [yaml.safe_load(block) for block in re.findall(r"^```yaml\n(.*?)^```", page, re.MULTILINE | re.DOTALL)]
+    jobs.insert(0, yaml.safe_load((REPOSITORY / "job_specs/my-task.yaml").read_text()))
     assert len(jobs) == 2
     for job in jobs:
         task_type = find_task(job["train"]["task"])
@@ -87,16 +125,10 @@ def test_the_tutorials_jobs_fit_the_example() -> None:
 def test_the_page_s_error_for_a_wrong_parameter_is_the_real_one(tmp_path: Path) -> None:
     page = module("own-task.md", tmp_path)
 
-    class Pendulum(page.Pendulum):
-        def declare(self, config):
-            return page.dataclasses.replace(
-                super().declare(config),
-                rewards={**super().declare(config).rewards, "upright": page.Reward(page.pointing, targt=1.0)},
-            )
-
+    wrong = page.Pendulum.with_(rewards={"upright": page.Reward(page.pointing, weight=1.0, targt=1.0)})
     line = next(line for line in (REPOSITORY / "docs/own-task.md").read_text().splitlines() if "targt" in line)
     with pytest.raises(ValueError, match="targt") as caught:
-        Pendulum.sketch(page.PendulumConfig())
+        wrong.sketch(wrong.config_type())
     assert str(caught.value) == line
 
 

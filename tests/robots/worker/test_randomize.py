@@ -331,7 +331,6 @@ def test_inverse_weights_follow_the_masses_as_in_mujoco(kind: str) -> None:
         ("gravity", {"seconds": (1.0, 2.0)}, "seconds is for when='interval' alone"),
         ("gravity", {"when": "interval", "seconds": (2.0, 1.0)}, "give two times above 0, the lesser first"),
         ("mass", {"bodies": "*", "at": (0.0, 0.0, 1.0)}, "only a payload has a place"),
-        ("mass", {"bodies": "*", "robot": None}, "bodies belong to a robot; name it"),
     ],
 )
 def test_a_declaration_that_can_not_be_is_refused(what: str, options: dict[str, Any], message: str) -> None:

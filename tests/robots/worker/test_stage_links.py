@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import newton
+from typing import Any
+
 import numpy as np
 
-from worker.settings.task import TaskConfig
-from worker.simulation.robot import Robot
-from worker.tasks.run.task import Task
+from tests.support.worker.declared import Small, SmallConfig
+from worker.tasks import Action, terms
 from worker.telemetry.picture import StageCamera
 from worker.telemetry.stage import Stage
 
@@ -17,13 +17,15 @@ TWO_JOINTS = """<mujoco><worldbody><body name="hip" pos="0 0 1">
 <actuator><motor joint="yaw"/></actuator></mujoco>"""
 
 
-class TwoJoints(Task):
-    def build(self, builder: newton.ModelBuilder) -> None:
-        Robot(TWO_JOINTS).add_to(builder)
+class TwoJoints(Small):
+    text = TWO_JOINTS
+
+    def sections(self) -> dict[str, Any]:
+        return {"actions": {"force": Action(terms.effort, joints="yaw")}}
 
 
 def test_a_body_of_two_joints_is_one_link() -> None:
-    stage = Stage(TwoJoints, TaskConfig(), 2)
+    stage = Stage(TwoJoints, SmallConfig(), 2)
     assert stage.model.body_count == 2 * 3, "one body carries the first joint"
     assert stage.links == ["hip", "shin"] and stage.root == 0
     assert set(stage.meshes()) - {"ground", ""} == {"hip", "shin"}

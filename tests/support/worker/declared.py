@@ -29,7 +29,7 @@ from worker.tasks import (
     reward_weights,
     terms,
 )
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 MODEL = """<mujoco><option gravity="0 0 0"/><worldbody><body name="near" pos="0 0 1">
   <joint name="first" type="slide" axis="1 0 0" range="-2 2"/>
@@ -80,13 +80,13 @@ def far_away(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, li
     return wp.abs(worlds.joint_q[world, robot.coordinates[joint]]) > limit
 
 
-def both(task: DeclaredTask, gain: float) -> torch.Tensor:
+def both(task: Task, gain: float) -> torch.Tensor:
     """A torch term: the positions of both sliders, times ``gain``."""
     places: torch.Tensor = gain * wp.to_torch(task.worlds.arrays.joint_q)
     return places
 
 
-def no_actions(task: DeclaredTask) -> torch.Tensor:
+def no_actions(task: Task) -> torch.Tensor:
     """A torch term: 1 where the first action is 0."""
     return (task.actions[:, 0] == 0.0).float()
 
@@ -98,7 +98,7 @@ class SmallConfig(TaskConfig):
     rewards: Mapping[str, float] = reward_weights(alive=1.0)
 
 
-class Small(DeclaredTask):
+class Small(Task):
     """A robot that is asked for nothing; a subclass names its file, and the sections of the declaration that matter."""
 
     config_type = SmallConfig
@@ -121,7 +121,7 @@ class Small(DeclaredTask):
         return Declaration(**{**usual, **self.sections()})
 
 
-class Sliders(DeclaredTask):
+class Sliders(Task):
     """Two sliders: every kind of term once."""
 
     config_type = SlidersConfig

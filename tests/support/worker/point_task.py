@@ -7,14 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import torch
 
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import Randomization
-from worker.tasks.run.task_report import Telling
+from worker.tasks.compile.binding import Bound
+from worker.tasks.compile.numbers import Numbers
+from worker.tasks.compile.plan import Seen
+from worker.tasks.declare.declaration import Observation
+from worker.tasks.declare.interface import Interface
+from worker.tasks.run.task_report import TaskReport
 
 
 @dataclass(frozen=True)
@@ -41,7 +46,7 @@ class PointConfig:
     ppo: PointPPO = field(default_factory=PointPPO)
 
 
-class Point(Telling):
+class Point(TaskReport):
     """Push a point to the middle: 2 observations (place, velocity), 1 action."""
 
     config_type = PointConfig
@@ -56,6 +61,7 @@ class Point(Telling):
     shown_metrics = MappingProxyType[str, str]({})
     action_size, discrete, observation_shape = 1, False, (2,)
     action_names = ("push",)
+    readings = MappingProxyType[str, Any]({})
     observation_names = ("place", "velocity")
     ended = None
     adapting = None
@@ -132,8 +138,17 @@ class Point(Telling):
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         pass
 
-    def interface(self) -> None:
-        return None
+    def interface(self) -> Interface:
+        return Interface((), ())
+
+    @property
+    def plan(self) -> Any:
+        """As much of a plan as a contract reads: a term for each observation."""
+        seen = [
+            Seen(Bound(f"observations.{name}", Observation(Point.step), None), [name], column, None, None, [], None, -1)
+            for column, name in enumerate(self.observation_names)
+        ]
+        return SimpleNamespace(groups={"policy": seen}, images={}, commands=(), numbers=Numbers())
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         names = ("place", "velocity", "observations", "episode_length", "_draws", "_steps", "_sums")

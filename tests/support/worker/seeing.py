@@ -19,7 +19,7 @@ from worker.simulation.sensors.camera import CameraArrays, CameraSensor
 from worker.simulation.worlds import WorldArrays
 from worker.tasks import terms
 from worker.tasks.declare.declaration import Action, Declaration, Event, Image, Observation, Reward
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -72,7 +72,7 @@ class SeeingConfig(TaskConfig):
     further_groups: ClassVar[Mapping[str, bool]] = {"camera": True}
 
 
-class Seeing(DeclaredTask):
+class Seeing(Task):
     """The cart looks ahead, at a box 2 m before it."""
 
     config_type = SeeingConfig

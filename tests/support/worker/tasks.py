@@ -23,7 +23,7 @@ def put(task: Task, **rows: list[Any]) -> None:
 
 def observe(task: Task) -> None:
     """Judge the state as it stands, as after a physics step."""
-    task._launch_observe(STEP)
+    task._control.judge_and_observe(int(STEP))
 
 
 def statistics(task: Task) -> dict[str, float]:

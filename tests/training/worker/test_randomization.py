@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from worker.settings.task import FACTORS, Randomization
 from worker.tasks.library.ant import Ant, AntConfig
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.library.quadruped import Quadruped, QuadrupedConfig
+from worker.tasks.run.task import Task
 
 ALL = Randomization(mass=(0.5, 2.0), friction=(0.5, 1.25), damping=(0.5, 3.0), gains=(0.8, 1.2), gravity=(0.9, 1.1))
 POSE = [0.0, 0.0, 3.0, 0.0, 0.0, 0.0, 1.0, *[0.0, 0.8, -1.6] * 4]
@@ -32,17 +34,28 @@ def differing() -> Quadruped:
     return Quadruped(QuadrupedConfig(randomize=ALL), 8, seed=1)
 
 
+def factors(task: Task) -> dict[str, np.ndarray]:
+    """The factors of each world, by name."""
+    assert task.randomizations is not None
+    names = [name.partition("/")[0].removeprefix("config_") for name in task.randomizations.names]
+    return dict(zip(names, task.randomizations.draws.numpy().T, strict=True))
+
+
 def test_the_solver_holds_of_each_world_what_was_drawn(plain: Quadruped, differing: Quadruped) -> None:
-    drawn = dict(zip(FACTORS, differing.randomizer.factors.numpy().T, strict=True))
+    drawn = factors(differing)
     before, after = plain.worlds.solver.mjw_model, differing.worlds.solver.mjw_model
-    assert torch.equal(plain.randomizer.factors, torch.ones(8, 5))
+    assert tuple(drawn) == FACTORS and factors(plain) == {}
     for name, values in drawn.items():
         least, greatest = getattr(ALL, name)
         assert len(set(values)) == 8 and (values >= least).all() and (values <= greatest).all()
         assert values.min() < least + 0.4 * (greatest - least) and values.max() > greatest - 0.4 * (greatest - least)
 
+    def numbers(model: Any, name: str) -> np.ndarray:
+        """Of each world; the principal axes of an inertia may come in another order."""
+        return np.sort(getattr(model, name).numpy()).reshape(8, -1)
+
     def ratio(name: str) -> np.ndarray:
-        old, new = getattr(before, name).numpy().reshape(8, -1), getattr(after, name).numpy().reshape(8, -1)
+        old, new = numbers(before, name), numbers(after, name)
         assert np.array_equal(old == 0, new == 0)
         return np.divide(new, old, out=np.ones_like(new), where=old != 0)
 
@@ -54,41 +67,40 @@ def test_the_solver_holds_of_each_world_what_was_drawn(plain: Quadruped, differi
     ):
         for name in names:
             change = ratio(name)
-            scaled = getattr(before, name).numpy().reshape(8, -1) != 0
+            scaled = numbers(before, name) != 0
             assert scaled.any()
             assert np.allclose(change[scaled], (drawn[factor][:, None] * np.ones_like(change))[scaled], rtol=1e-5), name
     assert np.allclose(after.opt.gravity.numpy()[:, 2], -9.81 * drawn["gravity"])
     # what the solver derives from masses: a heavier trunk is harder to move, in proportion but for the rotors' inertia
-    heavier = ratio("body_invweight0").reshape(8, -1, 2)[:, 1, 0]
+    weights = [model.body_invweight0.numpy()[:, 1, 0] for model in (before, after)]
+    heavier = weights[1] / weights[0]
     assert np.allclose(heavier * drawn["mass"], 1.0, atol=0.02)
 
 
 def test_worlds_fall_as_their_gravity_says_and_motors_push_as_their_gains(differing: Quadruped) -> None:
     put(differing, joint_q=[POSE] * 8, joint_qd=[[0.0] * 18] * 8)
     differing.step(torch.zeros(8, 12))
-    gravity = differing.randomizer.factors[:, FACTORS.index("gravity")]
+    gravity = torch.from_numpy(factors(differing)["gravity"])
     assert torch.allclose(differing.observations[:, 2], -9.81 / 50 * gravity, rtol=0.01), "in free fall for 0.02 s"
 
     ant = Ant(AntConfig(randomize={"gains": [0.5, 2.0]}), 4, seed=1)
     ant.step(0.5 * torch.ones(4, 8))
-    gains = ant.randomizer.factors[:, FACTORS.index("gains")]
+    gains = torch.from_numpy(factors(ant)["gains"])
     assert torch.allclose(wp.to_torch(ant.worlds.arrays.drives)[:, 6:], 0.5 * 15.0 * gains[:, None].expand(4, 8))
 
 
 def test_what_a_world_is_like_depends_on_its_seed_and_global_index_alone(differing: Quadruped) -> None:
-    drawn = differing.randomizer.factors
+    drawn = factors(differing)
     for first in (0, 4):
         half = Quadruped(QuadrupedConfig(randomize=ALL), 4, seed=1, first_world=first)
-        assert torch.equal(half.randomizer.factors, drawn[first : first + 4])
+        assert all((own == drawn[name][first : first + 4]).all() for name, own in factors(half).items())
         for name in ("body_mass", "geom_friction", "dof_damping", "actuator_gainprm"):
             whole = getattr(differing.worlds.solver.mjw_model, name).numpy()[first : first + 4]
             assert np.array_equal(getattr(half.worlds.solver.mjw_model, name).numpy(), whole), name
-    alone = Quadruped(QuadrupedConfig(randomize={"gains": ALL.gains}), 8, seed=1).randomizer.factors
-    column = FACTORS.index("gains")
-    assert torch.equal(alone[:, column], drawn[:, column]), "whatever else is drawn"
-    assert (alone[:, [index for index in range(5) if index != column]] == 1).all()
-    other = Quadruped(QuadrupedConfig(randomize=ALL), 8, seed=2).randomizer.factors
-    assert not (other == drawn).any()
+    alone = factors(Quadruped(QuadrupedConfig(randomize={"gains": ALL.gains}), 8, seed=1))
+    assert [*alone] == ["gains"] and (alone["gains"] == drawn["gains"]).all(), "whatever else is drawn"
+    other = factors(Quadruped(QuadrupedConfig(randomize=ALL), 8, seed=2))
+    assert not any((other[name] == drawn[name]).any() for name in FACTORS)
 
 
 def test_a_disabled_randomisation_changes_nothing_and_draws_nothing(plain: Quadruped) -> None:
@@ -96,7 +108,7 @@ def test_a_disabled_randomisation_changes_nothing_and_draws_nothing(plain: Quadr
     streams = plain.state_dict()["random"][:, 2].clone()
     plain.step(torch.zeros(8, 12))
     assert not plain.dones.any() and torch.equal(plain.state_dict()["random"][:, 2], streams)
-    assert not plain.state_dict().keys() & {"world_factors", "control_delays", "control_history"}
+    assert not plain.state_dict().keys() & {"randomization_draws", "control_delays", "control_history"}
     put(plain)
     history = play(plain, 20, seed=3)
     put(plain)
@@ -104,13 +116,19 @@ def test_a_disabled_randomisation_changes_nothing_and_draws_nothing(plain: Quadr
 
 
 def test_pushes_come_at_random_with_the_mean_that_was_asked_for() -> None:
-    task = Ant(AntConfig(randomize={"push_interval": 0.1, "push_velocity": 0.5}), 64, seed=1)
-    velocities = wp.to_torch(task.worlds.arrays.joint_qd)
+    settings = {
+        "randomize": {"push_interval": 0.1, "push_velocity": 0.5},
+        "episode_seconds": 100.0,
+        "fall_height": -9.0,
+    }
+    task = Ant(AntConfig(**settings), 64, seed=1)
+    velocities, moved = wp.to_torch(task.worlds.arrays.joint_qd), list[torch.Tensor]()
+    task.move = lambda: moved.append(velocities.clone())  # type: ignore[method-assign]
     changes = []
     for _ in range(60):
-        before = velocities.clone()
-        task.randomizer.push()
-        changes.append(velocities - before)
+        for _, part in task._control.parts():
+            part()
+        changes.append(velocities - moved[-1])
     changed = torch.stack(changes)
     assert not changed[..., 2:].any(), "pushes are horizontal"
     pushed = changed[..., :2].any(dim=2)
@@ -159,10 +177,20 @@ def test_controls_are_late_by_each_episode_s_latency() -> None:
     assert not torch.equal(task.state_dict()["control_delays"], delays)
 
 
-def test_a_state_of_worlds_with_other_physics_is_refused(differing: Quadruped) -> None:
+def test_a_state_brings_the_physics_of_its_worlds_also_that_of_an_older_version(differing: Quadruped) -> None:
     other = Quadruped(QuadrupedConfig(randomize=ALL), 8, seed=2)
-    with pytest.raises(ValueError, match="its worlds have other physics; use the same seed, first world and randomize"):
-        other.load_state_dict(differing.state_dict())
+    state = differing.state_dict()
+    draws = state["randomization_draws"]
+    for saved in (
+        state,
+        {**{key: each for key, each in state.items() if "randomization" not in key}, "world_factors": draws},
+    ):
+        other.restart(2, 0)
+        assert not torch.equal(other.state_dict()["randomization_draws"], draws)
+        other.load_state_dict(saved)
+        assert torch.equal(other.state_dict()["randomization_draws"], draws)
+        masses = [task.worlds.solver.mjw_model.body_mass.numpy() for task in (other, differing)]
+        assert np.array_equal(*masses)
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def test_joints_and_steps_read_as_the_tap_saw_them(recorded: Recorded, messages:
         np.testing.assert_array_equal(joints[number].velocity, rows.velocities[0, 1].astype(float))
         step = taken[number]
         assert (step.world, step.age, step.done) == (1, rows.mark("age")[0, 1], bool(rows.mark("done")[0, 1]))
-        assert step.reward_names == list(Cartpole.reward_terms) and step.action_names == ["slider"]
+        assert step.reward_names == list(Cartpole.config_type().rewards) and step.action_names == ["slider"]
         assert step.observation_names == ["slider_position", "hinge_position", "slider_velocity", "hinge_velocity"]
         np.testing.assert_array_equal(np.float32(step.observation), rows.observations[0, 1])
         np.testing.assert_array_equal(np.float32(step.reward_terms), rows.terms[0, 1])

@@ -13,13 +13,13 @@ import warp as wp
 
 import worker.tasks.library.cartpole as cartpole_module
 from tests.support.worker.tasks import observe, play, put, same, statistics
-from worker.settings.task import TaskConfig
 from worker.simulation.episodes import STEP
 from worker.tasks import find_task
 from worker.tasks.library.ant import Ant, AntConfig
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.library.humanoid import Humanoid, HumanoidConfig
 from worker.tasks.library.quadruped import Quadruped
+from worker.tasks.run.control_step import ControlStep
 from worker.tasks.run.task import Task
 
 torch.set_num_threads(1)
@@ -93,7 +93,7 @@ def test_a_replay_equals_the_launches(cartpole: Cartpole) -> None:
     addresses = cartpole.observations.data_ptr(), cartpole.rewards.data_ptr(), cartpole.statistics.data_ptr()
     replayed = play(cartpole, 60, seed=3)
     cartpole.load_state_dict(start)
-    replaying, cartpole._steps = cartpole._steps, [part for _, part in cartpole._parts()]
+    replaying, cartpole._steps = cartpole._steps, [part for _, part in cartpole._control.parts()]
     try:
         eager = play(cartpole, 60, seed=3)
     finally:
@@ -124,7 +124,7 @@ def test_statistics_are_sums_over_finished_episodes(cartpole: Cartpole) -> None:
     assert totals["episodes"] == episodes and totals["episode_length"] == total_length
     assert totals["episode_return"] == pytest.approx(total_return, rel=1e-5)
     assert totals["squared_return"] == pytest.approx(squares, rel=1e-5)
-    assert sum(totals[f"reward_{term}"] for term in Cartpole.reward_terms) == pytest.approx(total_return, rel=1e-5)
+    assert sum(totals[f"reward_{term}"] for term in CartpoleConfig().rewards) == pytest.approx(total_return, rel=1e-5)
     cartpole.clear_statistics()
     assert not cartpole.statistics.any()
 
@@ -167,21 +167,18 @@ def test_a_state_that_does_not_fit_is_refused_whole(cartpole: Cartpole) -> None:
 
 
 def test_a_task_without_reward_terms_is_refused() -> None:
-    class Unrewarded(Cartpole):
-        config_type = TaskConfig
+    unrewarded = Cartpole.with_(rewards=dict.fromkeys(CartpoleConfig().rewards))
+    with pytest.raises(
+        ValueError, match=r"^task Cartpole: rewards: there is none; declare one, such as Reward\(terms.alive, "
+    ):
+        unrewarded(unrewarded.config_type(), 2)
 
-    with pytest.raises(ValueError, match="task Unrewarded has no reward terms; give TaskConfig a field `rewards:"):
-        Unrewarded(TaskConfig(), 2)
 
-
-def test_a_step_that_replays_nothing_is_refused() -> None:
-    class Deaf(Cartpole):
-        def _judge_alone(self, mode: int) -> None:
-            if mode != STEP:
-                super()._judge_alone(mode)
-
-    with pytest.raises(RuntimeError, match="the captured step of task Deaf does not replay on cpu"):
-        Deaf(CartpoleConfig(), 2)
+def test_a_step_that_replays_nothing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    judge = ControlStep._judge
+    monkeypatch.setattr(ControlStep, "_judge", lambda self, mode: mode == STEP or judge(self, mode))
+    with pytest.raises(RuntimeError, match="the captured step of task Cartpole does not replay on cpu"):
+        Cartpole(CartpoleConfig(), 2)
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

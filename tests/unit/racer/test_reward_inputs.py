@@ -195,9 +195,9 @@ def test_the_function_is_the_one_term_and_has_a_weight() -> None:
     assert task.reward_terms == ("reward",) and "reward_reward" in task.statistic_names
     task.step(torch.zeros(1, 2))
     assert task.rewards.item() == 3.0
-    assert Racer.reward_terms == ("progress", "off_track", "crashed")
-    with pytest.raises(ValueError, match=r"rewards\.progress: .* has no term 'progress'; there are reward"):
-        RacerConfig(reward_function=task.config.reward_function, rewards={"progress": 1.0})
+    assert tuple(Racer.config_type().rewards) == ("progress", "off_track", "crashed")
+    with pytest.raises(ValueError, match=r"rewards\.progress: the task has no term 'progress'; "):
+        rewarded("def reward_function(params):\n    return 2\n", rewards={"progress": 1.0})
 
 
 @pytest.mark.parametrize("prefix", ["", "kept = []\n"])

@@ -128,14 +128,14 @@ def test_numbers_are_data_and_a_curriculum_sets_them() -> None:
     curriculum = {"terminations.first_left.limit": [[0, 1.0], [10, 3.0]], "place": [[0, 2.0]]}
     plain = Sliders.sketch(SlidersConfig())
     task = Sliders(SlidersConfig(numbers={"actions.force.scale": [5.0, 6.0]}, curriculum=curriculum), 2, seed=1)
-    assert task._kernels is not None and task.numbers("actions.force.scale").tolist() == [5.0, 6.0]
+    assert task.numbers("actions.force.scale").tolist() == [5.0, 6.0]
     assert plain.plan.numbers.places == task.plan.numbers.places
     other = Sliders(SlidersConfig(), 2, seed=1)
-    assert other._kernels.judge is task._kernels.judge, "changing a number compiles nothing"
+    assert other._control.kernels.judge is task._control.kernels.judge, "changing a number compiles nothing"
     for iteration, expected in ((0, 1.0), (5, 2.0), (20, 3.0)):
         task.begin_iteration(iteration, None, None)
         assert task.numbers("terminations.first_left.limit").tolist() == pytest.approx([expected])
-    assert task._weights[0] == 2.0
+    assert task._buffers["weights"][0] == 2.0
     put(task, joint_q=[[1.6, 0.0]])
     observe(task)
     assert not task.dones[0]
@@ -214,4 +214,4 @@ def test_a_second_task_of_the_same_terms_shares_their_kernels(sliders: Sliders) 
     class Others(Sliders):
         pass
 
-    assert Others(SlidersConfig(), 1, seed=1)._kernels.source == sliders._kernels.source
+    assert Others(SlidersConfig(), 1, seed=1)._control.kernels.source == sliders._control.kernels.source

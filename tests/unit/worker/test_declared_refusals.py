@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import warp as wp
 
-from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from tests.support.refusals import refusal
 from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, far_away, kick, target
 from worker.simulation.declared_randomization import Randomize
@@ -77,8 +76,8 @@ SECTIONS: Mapping[str, dict[str, Any]] = {
     f"commands.target.seconds: {TWO}'a'": commanded(seconds="a"),
     "commands.target.seconds: expected the least and the greatest time, above 0": commanded(seconds=(0.0, 1.0)),
     "commands.target: 2 units for 1 numbers; give one for each": commanded(units=("m", "s")),
-    "commands.target: names are (); name each number that the policy is told": commanded(names=()),
-    "commands.target: names are (3,); name each number that the policy is told": commanded(names=3),
+    "commands.target: names are (); name each number that the policy sees": commanded(names=()),
+    "commands.target: names are (3,); name each number that the policy sees": commanded(names=3),
     "commands.target: hidden is -1; give how many numbers, from 0 up": commanded(hidden=-1),
     f"events.e.seconds: {TWO}2.0": every(2.0),
     f"events.e.seconds: {TWO}(2.0,)": every((2.0,)),
@@ -126,7 +125,7 @@ MISFITS: dict[str, Any] = {
         terms.joint_position, robot="cube"
     ),
     "rewards.place.limit: expected a number, found (1.0, 2.0)": Reward(terms.joint_velocity_excess, limit=(1.0, 2.0)),
-    "rewards.plce: SlidersConfig.rewards has no weight of this name; did you mean place?": Reward(terms.alive),
+    "rewards.plce: it has no weight; give it one, such as Reward(…, weight=-1.0)": Reward(terms.alive),
     "terminations.typo: far_away has no parameter limt; did you mean limit?": Termination(far_away, limt=3.0),
     "terminations.out: far_away needs limit=float": Termination(far_away),
     "terminations.both: far_away has no parameter limt; did you mean limit?": Termination(
@@ -157,7 +156,7 @@ def test_other_refusals() -> None:
         Sliders.sketch(SlidersConfig(numbers={"rewards.plac.x": 1.0}))
     with pytest.raises(ValueError, match=r"config.numbers.actions.force.scale: expected 2 numbers, found 1.0"):
         Sliders.sketch(SlidersConfig(numbers={"actions.force.scale": 1.0}))
-    with pytest.raises(ValueError, match=r"rewards.Place: a term's name has small letters, digits and underscores"):
+    with pytest.raises(ValueError, match=r"rewards.Place: a name has small letters, digits and underscores"):
         Declaration(actions={}, observations={}, rewards={"Place": Reward(terms.alive)})
     with pytest.raises(ValueError, match=r"observations.policy.place: expected an Observation, found a Reward"):
         Declaration(actions={}, observations={"place": Reward(terms.alive)}, rewards={})
@@ -267,11 +266,3 @@ def test_a_robots_file_that_is_not_text_is_named(tmp_path: Path, name: str) -> N
         ValueError, match=rf"{name}: the file is not text in UTF-8 \(invalid start byte at byte 128\); declare its enc"
     ):
         Unreadable.sketch(SlidersConfig())
-
-
-def test_a_task_of_kernels_has_no_numbers_for_a_curriculum() -> None:
-    config = PendulumConfig(curriculum={"events.push.speed": ((0, 1.0),)})
-    with pytest.raises(
-        ValueError, match=r"^task PendulumByHand: curriculum: it has no number events.push.speed; declared"
-    ):
-        PendulumByHand(config, 1)

@@ -19,6 +19,7 @@ from worker.tasks import (
     Event,
     Metric,
     Observation,
+    Randomization,
     Robot,
     RobotArrays,
     Term,
@@ -142,6 +143,15 @@ def test_a_world_that_failed_in_what_no_event_places_begins_where_the_model_has_
     for _ in range(3):
         task.step(torch.zeros_like(task.actions))
     assert statistics(task)["nan_worlds"] == 1.0
+
+
+def test_a_factor_of_a_job_is_on_all_robots_and_objects() -> None:
+    plain, heavy = (
+        BesideACube(SlidersConfig(randomize=Randomization(mass=(factor, factor))), 1, seed=1) for factor in (1.0, 2.0)
+    )
+    masses = [task.worlds.solver.mjw_model.body_mass.numpy()[0, 1:] for task in (plain, heavy)]
+    assert len(masses[0]) == 3 and masses[1] == pytest.approx(2.0 * masses[0], rel=1e-5)
+    assert heavy.randomizations is not None and heavy.randomizations.names == ["mass/near", "config_mass"]
 
 
 class Filtered(Sliders):

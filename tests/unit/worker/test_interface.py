@@ -16,10 +16,7 @@ from worker.learning.setup import describe
 from worker.learning.training import Training
 from worker.settings.errors import UserError
 from worker.tasks import find_task
-from worker.tasks.declare.interface import Interface
-from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
-from worker.tasks.run.declared import DeclaredTask
-from worker.tasks.run.find import BUILT_IN
+from worker.tasks.library.cartpole import Cartpole
 from worker.tasks.run.task import Task
 
 WORLDS = 4
@@ -46,14 +43,8 @@ def joints(task: Task) -> tuple[torch.Tensor, torch.Tensor, int, int]:
     return wp.to_torch(arrays.joint_q), wp.to_torch(arrays.joint_qd), 7 * free, 6 * free
 
 
-def declared(task: Task) -> Interface:
-    interface = task.interface()
-    assert interface is not None
-    return interface
-
-
 def test_an_action_drives_its_joint_as_declared(task: Task) -> None:
-    actions = declared(task).actions
+    actions = task.interface().actions
     assert tuple(action.name for action in actions) == task.action_names
     put(task)
     q, qd, first_q, first_qd = (part.clone() if isinstance(part, torch.Tensor) else part for part in joints(task))
@@ -82,27 +73,13 @@ def described(task: Task) -> dict[str, Any]:
     return describe(Training.of(job, type(task)), task)
 
 
-def test_every_built_in_task_declares_its_interface_and_images_stand_for_themselves() -> None:
-    assert SETTINGS.keys() <= BUILT_IN.keys()
-    # of all others, as of these, it follows from the declaration; those of real robots are judged in tests/robots
-    assert all(issubclass(find_task(name), DeclaredTask) for name in BUILT_IN)
+def test_images_stand_for_themselves_in_the_contract() -> None:
     kind = find_task("CartpolePixels")
     task = kind(kind.config_type(), 1)
     contract = described(task)["contract"]
     assert contract["groups"][0]["image"]["camera"]["width"] == 64 and not contract["groups"][0]["terms"]
     assert contract["groups"][0]["image"]["channels"] == ["red", "green", "blue"]
     assert [action["name"] for action in contract["actions"]] == ["slider"]
-
-
-def test_an_interface_of_other_numbers_than_the_task_s_is_refused() -> None:
-    class Careless(Cartpole):
-        def interface(self) -> Interface:
-            own = super().interface()
-            return Interface(own.observations[::-1], own.actions)
-
-    there = r"task Careless: interface\(\) has other observations than the task, or in an"
-    with pytest.raises(ValueError, match=there):
-        Careless(CartpoleConfig(), 1)
 
 
 def observed(randomize: dict[str, Any]) -> Task:
@@ -136,9 +113,9 @@ def test_noise_is_in_the_unit_of_the_quantity_and_leaves_command_and_last_action
 ) -> None:
     blurred = observed({"observation_noise": noise})
     found = (blurred.observations - clean).std(dim=0).tolist()
-    kinds = [seen.kind for seen in declared(blurred).observations]
+    kinds = [seen.kind for seen in blurred.interface().observations]
     assert kinds.count("command") == 3 and kinds.count("previous_action") == 12
-    for seen, deviation in zip(declared(blurred).observations, found, strict=True):
+    for seen, deviation in zip(blurred.interface().observations, found, strict=True):
         wanted = [value for pattern, value in deviations.items() if fnmatch.fnmatch(seen.name, pattern)]
         expected = wanted[0] if wanted and seen.kind == "measured" else 0.0
         assert deviation == (pytest.approx(expected, rel=0.15) if expected else 0.0), seen.name

@@ -14,7 +14,6 @@ import pytest
 import torch
 import warp as wp
 
-from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from shared_store.contract.policy import Contract, read
 from shared_store.contract.policy_changes import differences, robot_changes
 from tests.support.worker.declared import Sliders, SlidersConfig, TorchSliders
@@ -24,7 +23,6 @@ from worker.settings.errors import UserError
 from worker.tasks import (
     Action,
     Declaration,
-    DeclaredTask,
     EffortActuator,
     ExplicitPDActuator,
     Observation,
@@ -32,14 +30,13 @@ from worker.tasks import (
     Reward,
     Robot,
     RobotArrays,
+    Task,
     TaskConfig,
     VelocityActuator,
     WorldArrays,
     reward_weights,
     terms,
 )
-from worker.tasks.declare.interface import Interface, motor
-from worker.tasks.declare.interface import Observation as Seen
 from worker.tasks.run.policy_contract import policy_contract
 
 WORLDS = 4
@@ -82,19 +79,9 @@ def test_a_recurrent_policy_s_inputs_and_state_are_in_the_contract(sliders: Slid
     assert contract.normalizer == "inside"
 
 
-def test_terms_in_torch_and_kernels_by_hand_have_the_same_document_with_less() -> None:
+def test_terms_in_torch_have_the_same_document_with_less() -> None:
     both = published(TorchSliders(SlidersConfig(), 1)).groups[0].terms[0]
     assert (both.names, both.quantity, both.element) == (("both_0", "both_1"), "both", "")
-
-    class Described(PendulumByHand):
-        def interface(self) -> Interface:
-            torque = motor(self.worlds.solver.mj_model, 0, "hinge", "N m", 0.0)
-            return Interface(tuple(map(Seen, self.observation_names, ("1", "1", "rad/s"))), (torque,))
-
-    swung = published(Described(PendulumConfig(), 1))
-    units = {term.names: (term.units, term.quantity) for term in swung.groups[0].terms[1:]}
-    assert units == {("sine",): (("1",), ""), ("velocity",): (("rad/s",), "")}
-    assert swung.action_names == ("hinge",) and swung.actions[0].scale == pytest.approx(swung.actions[0].effort_limit)
 
 
 class Other(Sliders):
@@ -207,7 +194,7 @@ class DrivenConfig(TaskConfig):
 def driven_by(function: Any, *actuators: Any, **options: Any) -> list[dict[str, Any]]:
     """The actions of the contract of a task whose robot is driven so."""
 
-    class Driven(DeclaredTask):
+    class Driven(Task):
         config_type = DrivenConfig
 
         def robot(self, config: DrivenConfig) -> Robot:

@@ -13,10 +13,7 @@ import torch
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
-from job_specs.my_kernels import PendulumByHand, PendulumConfig
 from tests.support.refusals import refusal
-from worker.learning.job import user_errors
-from worker.settings.errors import UserError
 from worker.simulation.actuators import (
     DCMotorActuator,
     EffortActuator,
@@ -29,6 +26,7 @@ from worker.simulation.objects import Box, Capsule, Sphere
 from worker.simulation.patterns import resolve
 from worker.simulation.robot import Robot
 from worker.simulation.robot_view import RobotView
+from worker.simulation.worlds import Worlds
 
 SERVO = PositionActuator("*", 60.0, 3.0)
 LEG = """<mujoco model="leg">{assets}<worldbody><body name="thigh" pos="0 0 1"><joint name="left_hip" range="-60 60"/>
@@ -217,16 +215,13 @@ SERVOS = '<position name="servo" joint="hinge" kp="30" kv="3"/><velocity joint="
 MIXED = '<motor joint="knee"/><position joint="hinge"/>'
 
 
-def task_with(add: Callable[[newton.ModelBuilder], Any], **options: Any) -> type[PendulumByHand]:
-    """A task with this robot; a state of a joint is all that the pendulum's kernels need."""
-
-    class Robot(PendulumByHand):
-        solver_options = {"disable_contacts": True, "njmax": 4, "nconmax": 0, **options}
-
-        def build(self, builder: newton.ModelBuilder) -> None:
-            add(builder)
-
-    return Robot
+def worlds_of(add: Callable[[newton.ModelBuilder], Any], **options: Any) -> Worlds:
+    """Two worlds of what is added to an empty builder."""
+    builder = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(builder)
+    add(builder)
+    solver = {"disable_contacts": True, "njmax": 4, "nconmax": 0, **options}
+    return Worlds(builder, 2, "cpu", timestep=1 / 120, substeps=2, fastest=1e3, ground=False, solver_options=solver)
 
 
 def mjcf(actuators: str, **options: Any) -> Callable[[newton.ModelBuilder], Any]:
@@ -245,18 +240,16 @@ def mjcf(actuators: str, **options: Any) -> Callable[[newton.ModelBuilder], Any]
 def test_a_robot_that_no_action_would_move_is_refused(
     add: Callable[[newton.ModelBuilder], Any], parts: list[str]
 ) -> None:
-    with pytest.raises(UserError) as error, user_errors():
-        task_with(add)(PendulumConfig(), 2)
-    assert str(error.value).startswith("task Robot: ") and "\n" not in str(error.value)
-    assert all(part in str(error.value) for part in parts), str(error.value)
+    said = refusal(worlds_of, add)
+    assert "\n" not in said and all(part in said for part in parts), said
 
 
 def test_the_same_servos_added_as_the_refusal_says_follow_their_controls() -> None:
-    task = task_with(mjcf(SERVOS, ctrl_direct=True))(PendulumConfig(), 2, seed=1)
-    controls, angles = wp.to_torch(task.worlds.arrays.controls), wp.to_torch(task.worlds.arrays.joint_q)
+    worlds = worlds_of(mjcf(SERVOS, ctrl_direct=True))
+    controls, angles = wp.to_torch(worlds.arrays.controls), wp.to_torch(worlds.arrays.joint_q)
     controls.copy_(torch.tensor([[0.3, 0.0], [-0.3, 0.0]]))
     for _ in range(120):
-        task.worlds.simulate()
+        worlds.simulate()
     assert angles[0, 0] > 0.2 and angles[1, 0] < -0.2
 
 
@@ -270,9 +263,8 @@ def test_the_same_servos_added_as_the_refusal_says_follow_their_controls() -> No
     ],
 )
 def test_an_option_of_the_solver_that_is_not_a_task_s_is_refused(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=r"task Robot: solver_options: ") as error:
-        task_with(mjcf('<motor joint="hinge"/>'), **options)(PendulumConfig(), 2)
-    assert message in str(error.value) and "\n" not in str(error.value)
+    said = refusal(worlds_of, mjcf('<motor joint="hinge"/>'), **options)
+    assert said.startswith("solver_options: ") and message in said and "\n" not in said
 
 
 def test_values_by_pattern_may_come_in_any_mapping() -> None:

@@ -113,7 +113,7 @@ FORMULAS = {"Cartpole": cartpole, "Ant": running, "Humanoid": running, "Quadrupe
 @pytest.fixture(scope="module", params=FORMULAS)
 def task(request: pytest.FixtureRequest) -> Task:
     kind = find_task(request.param)
-    weights = {name: 0.5 + number for number, name in enumerate(kind.reward_terms)}  # none as it comes
+    weights = {name: 0.5 + number for number, name in enumerate(kind.config_type().rewards)}  # none as it comes
     return kind(kind.config_type(rewards=weights), WORLDS, seed=3)
 
 

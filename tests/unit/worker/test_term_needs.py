@@ -61,11 +61,11 @@ SERVOS = (PositionActuator("*", stiffness=20.0, damping=0.5),)
 def test_a_smoothed_target_has_two_numbers_for_each_joint() -> None:
     action = Action(terms.smoothed_position_target, share=0.3, unit="m")
     task = sliders(Robot(MODEL, actuators=SERVOS), actions={"target": action}, randomize={})(SlidersConfig(), 2, seed=1)
-    command = task._memory[:, task.plan.commands[0].first].clone()
+    command = task._buffers["memory"][:, next(iter(task.plan.binder.commands.values()))].clone()
     # the command and its countdown, two numbers for each of two joints, the countdown of the event
-    assert task.memory_size == 2 + 4 + 1
+    assert task.plan.binder.memory == 2 + 4 + 1
     task.step(torch.full_like(task.actions, 0.7))
-    assert torch.equal(task._memory[:, task.plan.commands[0].first], command)
+    assert torch.equal(task._buffers["memory"][:, next(iter(task.plan.binder.commands.values()))], command)
 
 
 def test_a_command_has_hidden_numbers_of_its_function() -> None:
@@ -73,7 +73,7 @@ def test_a_command_has_hidden_numbers_of_its_function() -> None:
     seen = {"v": Observation(terms.command_number)}
     plan = sliders(commands={"v": command}, curricula={}, events={}, observations=seen).sketch(SlidersConfig())
     # three numbers, six hidden ones, the countdown; no term has further ones
-    assert plan.memory_size == 3 + 6 + 1 and plan.plan.commands[0].countdown == 9
+    assert plan.plan.binder.memory == 3 + 6 + 1 and plan.plan.commands[0].countdown == 9
     assert plan.observation_names == ("v_0", "v_1", "v_2"), "all numbers of the command"
 
 

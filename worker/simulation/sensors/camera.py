@@ -15,11 +15,7 @@ from newton.sensors import SensorCamera
 
 from shared_store.contract.error_text import nearest
 from worker.simulation.episodes import EpisodeArrays, random_stream
-from worker.simulation.robot_arrays import BodyArrays
-from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext, views_of
-from worker.simulation.world_cameras import (
+from worker.simulation.rendering import (
     displace,
     displaced,
     draw_light,
@@ -30,6 +26,10 @@ from worker.simulation.world_cameras import (
     shapes_of_worlds,
     to_byte,
 )
+from worker.simulation.robot_arrays import BodyArrays
+from worker.simulation.robot_view import RobotView
+from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
+from worker.simulation.sensors.sensor import SensorContext, views_of
 
 if TYPE_CHECKING:
     from worker.settings.task import Randomization
@@ -351,6 +351,7 @@ class Camera:
             own = self.declared.position_range, self.declared.angle_range
             self._displace(self._stream - 1, *own, self._usual, self._mounts)
         draw_light(randomize.light, self._episodes, self._light)
+        self._update_poses()
 
     def _displace(
         self, stream: int, position: Any, angle: Any, given: wp.array[wp.transform], poses: wp.array[wp.transform]
@@ -358,17 +359,22 @@ class Camera:
         inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, given]
         wp.launch(displace, dim=given.shape, inputs=inputs, outputs=[poses], device=self._device)
 
+    def _update_poses(self) -> None:
+        inputs = [self._bodies, self._body, self._mounts, self.arrays]
+        wp.launch(_follow, dim=self._mounts.shape, inputs=inputs, device=self._device)
+
     def advance(self) -> None:
         """No-op: one image per step is taken, after resets."""
 
     def settle(self) -> None:
         """Render every world; an episode's first image also fills the earlier frames."""
-        declared, count = self.declared, self._mounts.shape
+        declared = self.declared
         if declared.redraw:
             ranges = [wp.vec3(*_three(declared.position_range)), wp.vec3(*_three(declared.angle_range))]
             inputs = [*ranges, self._episodes, self._usual]
-            wp.launch(_redraw, dim=count, inputs=inputs, outputs=[self._mounts], device=self._device)
-        wp.launch(_follow, dim=count, inputs=[self._bodies, self._body, self._mounts, self.arrays], device=self._device)
+            wp.launch(_redraw, dim=self._mounts.shape, inputs=inputs, outputs=[self._mounts], device=self._device)
+        if declared.redraw or self._body >= 0:
+            self._update_poses()
         output = {"depth": "forward_depth_image", "segmentation": "shape_index_image"}.get(declared.kind, "color_image")
         image: dict[str, Any] = {output: self._pixels}
         self._sensor.update(self._worlds.state, self.arrays.poses, self._rays, **image)

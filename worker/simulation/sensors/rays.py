@@ -12,12 +12,12 @@ import torch
 import warp as wp
 
 from worker.simulation.kinematics import yaw_quaternion
+from worker.simulation.rendering import renderer
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import ALIGNMENTS, FEW_POINTS, GridPattern, RingPattern
 from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
 from worker.simulation.sensors.sensor import SensorContext, views_of
-from worker.simulation.world_cameras import renderer
 
 wp.set_module_options({"enable_backward": False})
 

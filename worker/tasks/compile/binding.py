@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from math import isfinite
@@ -11,6 +12,7 @@ from shared_store.contract.error_text import nearest, shown
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import HeightScanArrays
 from worker.tasks import terms
+from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.compile.numbers import EXPRESSIONS, Numbers, stays
 from worker.tasks.declare.declaration import Command, Pattern, Term
 from worker.tasks.declare.functions import (
@@ -24,6 +26,9 @@ from worker.tasks.declare.functions import (
     signature,
 )
 from worker.tasks.declare.term_needs import Needs, needs_of
+
+_PLURALS = {"joint": "joints", "body": "bodies", "site": "sites"}
+"""The option of a term that selects elements of a kind."""
 
 
 @dataclass
@@ -39,6 +44,7 @@ class Bound:
         arguments: Its parameters as expressions of the kernel; the others (``world``, elements) are variables of the kernel.
         memory: First column of its own memory, -1 without any.
         external: First column of a torch term's result, -1 for a Warp function.
+        chosen: The elements that a torch function takes, by parameter: ``joints``, ``bodies`` or ``sites``.
         width: Numbers of one result.
     """
 
@@ -50,6 +56,7 @@ class Bound:
     arguments: dict[str, str] = field(default_factory=dict)
     memory: int = -1
     external: int = -1
+    chosen: dict[str, list[int]] = field(default_factory=dict)
     width: int = 1
 
     @property
@@ -80,11 +87,10 @@ class Binder:
         numbers: All numbers of the bound terms.
         structs: Variables of structs in the kernels, and their types.
         commands: First column in memory of each command, by name.
-        told: Count of the numbers of each command that the policy sees.
+        visible: Count of the numbers of each command that the policy sees.
         hidden: Count of the hidden numbers of each command, which follow those.
         memory: Number of allocated columns of ``episodes.memory``.
         lasting: Number of allocated columns of ``episodes.lasting``.
-        external: Columns of torch terms.
         indices: Elements that are not a range of whole numbers, one selection after the other.
     """
 
@@ -93,13 +99,12 @@ class Binder:
         self.numbers = Numbers()
         self.structs: dict[str, Any] = {}
         self.commands: dict[str, int] = {}
-        self.told: dict[str, int] = {}
+        self.visible: dict[str, int] = {}
         self.hidden: dict[str, int] = {}
         self.actions: list[str] = []
         self.indices: list[int] = []
         self.memory = 0
         self.lasting = 0
-        self.external = 0
 
     def bind(self, place: str, term: Term, *, element: bool = True, own: Mapping[str, str] | None = None) -> Bound:
         """Bind a term.
@@ -119,10 +124,8 @@ class Binder:
                 raise ValueError(f"{place}: {name} is {shown(count)}; give a whole number from {least} up")
         if not is_warp(term.function):
             return self._bind_torch(place, term)
-        try:
+        with placed(place):
             found = signature(term.function)
-        except ValueError as error:
-            raise ValueError(f"{place}: {error}") from error
         bound = Bound(place, term, found, width=max(found.width, 1))
         given = dict(found.defaults) | term.parameters
         if found.element:
@@ -145,8 +148,18 @@ class Binder:
     def _bind_torch(self, place: str, term: Term) -> Bound:
         if not callable(term.function):
             raise ValueError(f"{place}: {shown(term.function)} is no function; {_function_instead(term.function)}")
-        bound = Bound(place, term, None, width=term.size or 1, external=self.external)
-        self.external += bound.width
+        bound = Bound(place, term, None, width=term.size or 1)
+        found = inspect.signature(term.function)
+        for element, name in _PLURALS.items():
+            if name in found.parameters and name not in term.parameters:
+                view = self._view(place, term.robot)
+                bound.chosen[name], _ = find(place, view, element, getattr(term, name))
+            elif getattr(term, name) != ("*" if element == "joint" else None):
+                raise ValueError(f"{place}: {term.function_name} has no parameter {name}; leave {name}= out")
+        try:
+            found.bind("the task", **term.parameters, **bound.chosen)
+        except TypeError as error:
+            raise ValueError(f"{place}: {term.function_name}: {error}") from error
         return bound
 
     def _indices(self, place: str, term: Term, found: Signature, given: Mapping[str, Any]) -> list[str]:
@@ -167,7 +180,7 @@ class Binder:
             return [str(index) for index in range(needed.size)], f"elements of {found.name}"
         if needed.numbers:
             name = self._command_name(place, given.get("command"))
-            return [str(index) for index in range(self.told[name])], f"numbers of the command {name}"
+            return [str(index) for index in range(self.visible[name])], f"numbers of the command {name}"
         counts: dict[str, int] = {}
         names: list[str] = []
         for parameter, kind in found.parameters.items():
@@ -250,9 +263,7 @@ class Binder:
                 )
             return list(range(len(self.actions))), list(self.actions)
         view = self._view(place, term.robot)
-        return find(
-            place, view, element, getattr(term, {"joint": "joints", "body": "bodies", "site": "sites"}[element])
-        )
+        return find(place, view, element, getattr(term, _PLURALS[element]))
 
     def _view(self, place: str, name: str) -> RobotView:
         if name not in self.views:
@@ -306,7 +317,7 @@ class Binder:
                 f"{place}: {term.function_name} hides {drawn.hidden} numbers, and hidden is {term.hidden}; leave hidden= out"
             )
         steering = needs_of(term.update.function) if term.update else drawn
-        self.commands[name], self.told[name] = self.memory, len(term.names)
+        self.commands[name], self.visible[name] = self.memory, len(term.names)
         self.hidden[name] = max(term.hidden, drawn.hidden, steering.hidden)
         self.memory += len(term.names) + self.hidden[name] + 1
 
@@ -315,23 +326,23 @@ class Binder:
             return next(iter(self.commands))
         if name not in self.commands:
             known = nearest(str(name), list(self.commands)) if self.commands else "the task declares none"
-            wanted = "say which command it is of, with command=" if name is None else f"there is no command {name!r}"
-            raise ValueError(f"{place}: {wanted}; {known}")
+            words = "say which command it is of, with command=" if name is None else f"there is no command {name!r}"
+            raise ValueError(f"{place}: {words}; {known}")
         return str(name)
 
     def _command(self, bound: Bound, name: Any) -> int:
         found = self._command_name(bound.place, name)
-        self.check_told(bound, found)
+        self.check_command(bound, found)
         return self.commands[found]
 
-    def check_told(self, bound: Bound, command: str) -> None:
+    def check_command(self, bound: Bound, command: str) -> None:
         """Refuse a term that reads or writes more numbers than its command has."""
         needed = needs_of(bound.term.function)
-        if needed.command > self.told[command] or needed.hidden > self.hidden[command]:
-            wanted = f"{needed.command} numbers" + (f" and {needed.hidden} hidden ones" if needed.hidden else "")
-            there = f"{self.told[command]}" + (f" and {self.hidden[command]}" if needed.hidden else "")
+        if needed.command > self.visible[command] or needed.hidden > self.hidden[command]:
+            expected = f"{needed.command} numbers" + (f" and {needed.hidden} hidden ones" if needed.hidden else "")
+            found = f"{self.visible[command]}" + (f" and {self.hidden[command]}" if needed.hidden else "")
             raise ValueError(
-                f"{bound.place}: {bound.term.function_name} needs a command of {wanted}; {command} has {there}"
+                f"{bound.place}: {bound.term.function_name} needs a command of {expected}; {command} has {found}"
             )
 
     def _struct(self, bound: Bound, name: str, kind: Any, given: Mapping[str, Any]) -> str:
@@ -376,9 +387,9 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
         ValueError: None fits, or none was named.
     """
     if pattern is None:
-        plural = {"body": "bodies"}.get(element, f"{element}s")
+        plural = _PLURALS[element]
         raise ValueError(f"{place}: say which {plural} it is for, with {plural}=")
-    try:
+    with placed(place):
         if element == "joint":
             found = view.find_joints(pattern)
             return found, [view.joint_names[each] for each in found]
@@ -387,8 +398,6 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
             return [view.bodies[each] for each in found], [view.body_names[each] for each in found]
         found = view.find_sites(pattern)
         return found, [view.site_names[each] for each in found]
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
 
 
 def _function_instead(given: Any) -> str:

@@ -1,7 +1,7 @@
 """The compiler of a plan to kernels: one for actions; one for rewards, resets and observations (two if observations need bodies or sensors).
 
-The source of the kernels is generated and compiled as Warp code under the name of the task. Numbers are read from an array, so that
-the source, and with it the compiled module, does not depend on their values.
+The source of the kernels is generated and compiled as Warp code, under a name made of the source and of the functions that it calls.
+It depends neither on the task's name nor on numbers, weights and terms in torch, which are data: changing these compiles nothing.
 """
 
 from __future__ import annotations
@@ -16,14 +16,16 @@ from typing import Any
 import warp as wp
 
 from worker.tasks.compile.binding import Bound
+from worker.tasks.compile.external import TIME_OUT
 from worker.tasks.compile.observing import group_function
-from worker.tasks.compile.plan import KernelPlan, Told
+from worker.tasks.compile.plan import KernelPlan, Timed
 from worker.tasks.compile.source import Source, call_of, calls, loop, parameters_of
 from worker.tasks.declare.declaration import Event, Reward, Termination
+from worker.tasks.declare.functions import is_warp
 
 COMMON = (
     "numbers: wp.array[wp.float32], indices: wp.array[wp.int32], past: wp.array2d[wp.float32], "
-    "external: wp.array2d[wp.float32], seconds: float, worlds: WorldArrays, episodes: EpisodeArrays"
+    "external: ExternalArrays, seconds: float, worlds: WorldArrays, episodes: EpisodeArrays"
 )
 """Parameters of every kernel, after its own."""
 
@@ -32,7 +34,6 @@ class Kernels:
     """The kernels of a task.
 
     Args:
-        name: Of the task.
         plan: Their contents.
         apart: Whether observations have a kernel of their own, after the update of bodies and sensors.
 
@@ -46,7 +47,7 @@ class Kernels:
         source: The source of all of them.
     """
 
-    def __init__(self, name: str, plan: KernelPlan, apart: bool) -> None:
+    def __init__(self, plan: KernelPlan, apart: bool) -> None:
         source = Source(plan)
         self.structs = source.structs
         text = [act(source)]
@@ -57,7 +58,7 @@ class Kernels:
         if happening(plan, "startup"):
             text.append(startup(source))
         self.source = "\n\n".join([*functions, *text])
-        found = compiled(name, self.source, source.scope(), [*map(title, functions)], [*map(title, text)])
+        found = compiled(self.source, source.scope(), [*map(title, functions)], [*map(title, text)])
         self.act, self.judge = found["act"], found["judge"]
         self.observe, self.startup = found.get("observe"), found.get("startup")
 
@@ -76,24 +77,26 @@ def title(text: str) -> str:
     return found[1]
 
 
-_COMPILED: dict[tuple[str, str, tuple[Any, ...]], dict[str, Any]] = {}
-"""Kernels of this process: a second task with the same source loads nothing again."""
+_COMPILED: dict[tuple[str, tuple[int, ...]], dict[str, Any]] = {}
+"""Kernels of this process: a second task with the same source and functions loads nothing again."""
 
 
-def compiled(name: str, text: str, scope: dict[str, Any], functions: list[str], kernels: list[str]) -> dict[str, Any]:
+def compiled(text: str, scope: dict[str, Any], functions: list[str], kernels: list[str]) -> dict[str, Any]:
     """Warp kernels of a source, by name."""
-    key = (name, text, tuple(id(value) for value in scope.values()))
+    called = [
+        f"{each.func.__module__}.{each.func.__qualname__}" for each in scope.values() if is_warp(each) and each.func
+    ]
+    digest = hashlib.sha256("\n".join([text, *called]).encode()).hexdigest()[:12]
+    key = (digest, tuple(id(value) for value in scope.values()))
     if key in _COMPILED:
         return _COMPILED[key]
-    digest = hashlib.sha256(text.encode()).hexdigest()[:12]
-    label = re.sub(r"\W", "_", name)
-    # equal in every process, whatever was built before, so that Warp finds it in its cache on the disk
-    alike = sum(known[:2] == key[:2] for known in _COMPILED)
-    file = f"<task {label} {digest}-{alike}>"
+    # the number tells apart a function and its later version in the same process
+    name = f"{digest}-{sum(known[0] == digest for known in _COMPILED)}"
+    file = f"<task {name}>"
     # tracebacks and Warp itself find the source here
     linecache.cache[file] = (len(text), None, [f"{line}\n" for line in text.split("\n")], file)
     exec(compile(text, file, "exec"), scope)
-    module = wp.get_module(f"muster.{label}.{digest}.{alike}")
+    module = wp.get_module(f"muster.task.{name}")
     module.options["enable_backward"] = False
     for function in functions:
         scope[function] = wp.func(scope[function], module=module)
@@ -130,7 +133,8 @@ def judge(source: Source, apart: bool) -> str:
             *remember_actions(plan, "episodes.actions[world, k]"),
             "sound = valid and episodes.broken[world] == 0 and wp.isfinite(episodes.rewards[world])",
             "limit = int(max_age)",
-            *(["if cut:", "    limit = 0"] if cuts(plan) else []),
+            "if cut:",
+            "    limit = 0",
             "restart = end_step(episodes, worlds.overflow, world, terminated, valid, limit)",
             *count_ends(plan),
             "if restart:",
@@ -188,26 +192,21 @@ def startup(source: Source) -> str:
 
 def terminations(source: Source) -> list[str]:
     """``ended_0``, …, and from them ``terminated`` and ``cut``; no termination counts in a world whose physics failed."""
-    plan = source.plan
-    lines = ["terminated = bool(False)", "cut = bool(False)"]
-    lines += [f"ended_{number} = bool(False)" for number in range(len(plan.terminations))]
-    body = []
-    for number, bound in enumerate(plan.terminations):
+    bounds = source.plan.in_warp("terminations")
+    lines = [f"ended_{number} = bool(False)" for number in range(len(bounds))]
+    body = ["terminated = external_end(external, world, 0)", f"cut = external_end(external, world, {TIME_OUT})"]
+    for number, bound in enumerate(bounds):
         hit = f"ended_{number} = True"
         body += calls(source, bound, partial(lambda hit, call: [f"if {call}:", f"    {hit}"], hit))
         flag = "cut" if isinstance(bound.term, Termination) and bound.term.time_out else "terminated"
         body += [f"if ended_{number}:", f"    {flag} = True"]
-    return [*lines, *(["if valid:", *indent(body)] if body else [])]
-
-
-def cuts(plan: KernelPlan) -> list[Bound]:
-    """The terminations that count as time-outs."""
-    return [bound for bound in plan.terminations if isinstance(bound.term, Termination) and bound.term.time_out]
+    return ["terminated = bool(False)", "cut = bool(False)", *lines, "if valid:", *indent(body)]
 
 
 def rewards(source: Source) -> list[str]:
     """Every reward term and metric of a world whose physics did not fail. Terms of the same elements share a loop."""
-    bounds = [*source.plan.rewards, *source.plan.metrics]
+    first = source.plan.in_warp("rewards")
+    bounds = [*first, *source.plan.in_warp("metrics")]
     alive = [bound for bound in bounds if isinstance(bound.term, Reward) and bound.term.unless_terminated]
     always = [bound for bound in bounds if bound not in alive]
     lines = [f"total_{number} = float(0.0)" for number in range(len(bounds))]
@@ -217,15 +216,14 @@ def rewards(source: Source) -> list[str]:
     for number, bound in enumerate(bounds):
         if isinstance(bound.term, Reward):
             value = f"seconds * total_{number}" if bound.term.per_second else f"total_{number}"
-            lines += [f"add_reward(episodes, world, {number}, {value})"]
+            lines += [f"add_reward(episodes, world, external.rewards[{number}], {value})"]
         else:
-            # a non-finite value would spoil the mean over all worlds
-            column = f"episodes.sums[world, TERMS + {number}]"
-            kept = f"total_{number}" if getattr(bound.term, "at_end", False) else f"{column} + total_{number}"
-            lines += [f"if wp.isfinite(total_{number}):", f"    {column} = {kept}"]
+            at_end = getattr(bound.term, "at_end", False)
+            metric = f"external.metrics[{number - len(first)}]"
+            lines += [f"add_metric(episodes, world, {metric}, total_{number}, {at_end})"]
     if source.plan.success is not None:
         lines += [f"episodes.successes[world] = {source.plan.success}"]
-    return ["if valid:", *indent(lines)] if bounds else []
+    return ["if valid:", *indent([*lines, "judge_external(external, episodes, world, terminated, seconds)"])]
 
 
 def totals(source: Source, bounds: list[Bound], some: list[Bound]) -> list[str]:
@@ -263,19 +261,13 @@ def remember_actions(plan: KernelPlan, value: str) -> list[str]:
 
 def count_ends(plan: KernelPlan) -> list[str]:
     """Record and count the cause of the episode's end, if the end counts."""
-    first = f"TERMS + {len(plan.rewards) + len(plan.metrics)} + 4"
     lines = []
-    for number in reversed(range(len(plan.terminations))):  # of several at once, the first is the cause
-        lines += [f"if ended_{number}:", f"    episodes.causes[world] = TERMINATED + {number + 1}"]
-    for number, _ in enumerate(plan.terminations):
-        lines += [
-            f"if ended_{number}:",
-            f"    wp.atomic_add(episodes.statistics, {first} + {number}, wp.float64(1.0))",
-        ]
-    clock = "not terminated and not cut and episodes.time_outs[world]"
+    for number, _ in enumerate(plan.in_warp("terminations")):
+        lines += [f"if ended_{number}:", f"    count_end(episodes, world, external.ends[{number}])"]
     lines += [
-        f"if {clock}:",
-        f"    wp.atomic_add(episodes.statistics, {first} + {len(plan.terminations)}, wp.float64(1.0))",
+        "count_external_ends(external, episodes, world)",
+        "if not terminated and not cut and episodes.time_outs[world]:",
+        "    wp.atomic_add(episodes.statistics, episodes.statistics.shape[0] - 1, wp.float64(1.0))",
     ]
     return ["if sound and restart:", *indent(lines)]
 
@@ -283,47 +275,42 @@ def count_ends(plan: KernelPlan) -> list[str]:
 def running(source: Source) -> list[str]:
     """Commands and interval events of a world whose episode goes on."""
     lines: list[str] = []
-    for told in source.plan.commands:
-        column = f"episodes.memory[world, {told.countdown}]"
-        lines += [
-            f"{column} = {column} - 1.0",
-            f"if {column} < 0.5:",
-            *indent(drawn(source, told.bound, column, told.seconds)),
-            *updated(source, told),
-        ]
-    for event in source.plan.events:
-        if event.countdown < 0:
+    for timed in (*source.plan.commands, *source.plan.events):
+        if timed.countdown < 0:
             continue
-        column = f"episodes.memory[world, {event.countdown}]"
+        column = f"episodes.memory[world, {timed.countdown}]"
         lines += [
             f"{column} = {column} - 1.0",
             f"if {column} < 0.5:",
-            *indent(drawn(source, event.bound, column, event.seconds)),
+            *indent(drawn(source, timed)),
+            *updated(source, timed),
         ]
     return ["if not restart:", *indent(lines)] if lines else []
 
 
-def drawn(source: Source, bound: Bound, countdown: str, seconds: int) -> list[str]:
+def drawn(source: Source, timed: Timed) -> list[str]:
     """Call a term with a random stream of its own, and draw its duration."""
     return [
         "stream = random_stream(episodes, world)",
-        *wait(countdown, seconds),
-        *calls(source, bound, lambda call: [call]),
+        *wait(timed),
+        *calls(source, timed.bound, lambda call: [call]),
     ]
 
 
-def updated(source: Source, told: Told) -> list[str]:
+def updated(source: Source, timed: Timed) -> list[str]:
     """Call a command's update, in every step."""
-    if told.update is None:
+    if timed.update is None:
         return []
-    stream = ["stream = random_stream(episodes, world)"] if told.update.takes("stream") else []
-    return [*stream, *calls(source, told.update, lambda call: [call])]
+    stream = ["stream = random_stream(episodes, world)"] if timed.update.takes("stream") else []
+    return [*stream, *calls(source, timed.update, lambda call: [call])]
 
 
-def wait(countdown: str, seconds: int) -> list[str]:
+def wait(timed: Timed) -> list[str]:
     """Draw a time in control steps, at least one."""
-    ends = f"numbers[{seconds}], numbers[{seconds + 1}]"
-    return [f"{countdown} = wp.max(1.0, wp.round(wp.randf(stream, {ends}) / seconds))"]
+    ends = f"numbers[{timed.seconds}], numbers[{timed.seconds + 1}]"
+    return [
+        f"episodes.memory[world, {timed.countdown}] = wp.max(1.0, wp.round(wp.randf(stream, {ends}) / seconds))",
+    ]
 
 
 def reset(source: Source) -> list[str]:
@@ -336,13 +323,11 @@ def reset(source: Source) -> list[str]:
     lines += ["for k in range(episodes.actions.shape[1]):"]
     lines += ["    episodes.earlier_actions[world, k] = 0.0", "    episodes.last_actions[world, k] = 0.0"]
     lines += each(source, happening(plan, "reset"))
-    for told in plan.commands:
-        lines += drawn(source, told.bound, f"episodes.memory[world, {told.countdown}]", told.seconds)
-        lines += updated(source, told)
+    for command in plan.commands:
+        lines += drawn(source, command) + updated(source, command)
     for event in plan.events:
         if event.countdown >= 0:
-            lines += ["stream = random_stream(episodes, world)"]
-            lines += wait(f"episodes.memory[world, {event.countdown}]", event.seconds)
+            lines += ["stream = random_stream(episodes, world)", *wait(event)]
     return lines
 
 

@@ -70,7 +70,7 @@ def described(plan: KernelPlan, seen: Seen, back: int = 0) -> list[Observation]:
     ranges: Sequence[Any] = [None] * len(names)
     if kind == "command" and seen.bound.takes("command"):
         units, ranges = _commanded(plan, seen, units)
-    clip = None if seen.clip is None else (plan.numbers.values[seen.clip], plan.numbers.values[seen.clip + 1])
+    clip = None if seen.clip is None else plan.numbers.pair(seen.clip)
     return [
         Observation(
             f"{name}_{back}" if back else name,
@@ -108,15 +108,13 @@ def range_of(plan: KernelPlan, name: str, command: Command, column: str) -> tupl
     if column in command.ranges:
         return command.ranges[column]
     first, count = plan.numbers.places.get(f"commands.{name}.{column}", (0, 0))
-    return (plan.numbers.values[first], plan.numbers.values[first + 1]) if count == 2 else None
+    return plan.numbers.pair(first) if count == 2 else None
 
 
 def _actions(plan: KernelPlan, driven: Driven, model: Any, motors: Explicit | None) -> list[Action]:
     term = driven.bound.term
     assert isinstance(term, DeclaredAction)
-    clip = None
-    if driven.clip is not None:
-        clip = (plan.numbers.values[driven.clip], plan.numbers.values[driven.clip + 1])
+    clip = None if driven.clip is None else plan.numbers.pair(driven.clip)
     if frame := frame_of(driven.bound, plan.declaration.sensors):
         return _movements(plan, driven, frame, clip)
     view = plan.views[term.robot]

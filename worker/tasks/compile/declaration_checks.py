@@ -11,6 +11,7 @@ from worker.tasks.compile.numbers import flat
 
 if TYPE_CHECKING:
     from worker.simulation.declared_randomization import Randomize
+    from worker.tasks.compile.binding import Bound
     from worker.tasks.declare import declaration
 
 
@@ -32,10 +33,30 @@ def check_observation(place: str, term: declaration.Observation, columns: int) -
         raise ValueError(f"{place}: {len(term.unit)} units for {columns} columns; give one for all, or one for each")
 
 
+def check_result(bound: Bound, section: str) -> None:
+    """Refuse a function whose result its section can't use."""
+    if bound.signature is None:
+        if section in ("events", "commands", "actions", "curricula"):
+            raise ValueError(
+                f"{bound.place}: a torch term observes, rewards or ends an episode; write this one as a @wp.func"
+            )
+        if section in ("rewards", "metrics", "terminations") and bound.width != 1:
+            raise ValueError(f"{bound.place}: size is {bound.width}; a term of this section gives one number a world")
+        return
+    returns = bound.signature.returns
+    name = bound.signature.name
+    if section in ("rewards", "metrics") and (returns is None or bound.width != 1):
+        raise ValueError(f"{bound.place}: {name} must give a float (-> float), one number a world or element")
+    if section == "terminations" and returns is not bool:
+        raise ValueError(f"{bound.place}: {name} must give a bool (-> bool): whether the episode ends")
+    if section.startswith("observations") and returns is None:
+        raise ValueError(f"{bound.place}: {name} gives nothing; annotate its result, such as -> float")
+
+
 def check_command(place: str, term: declaration.Command) -> None:
     """Raise ValueError for invalid names or units of a command."""
     if not term.names or not all(isinstance(name, str) for name in term.names):
-        raise ValueError(f"{place}: names are {shown(term.names)}; name each number that the policy is told")
+        raise ValueError(f"{place}: names are {shown(term.names)}; name each number that the policy sees")
     if len(term.units) != len(term.names):
         raise ValueError(f"{place}: {len(term.units)} units for {len(term.names)} numbers; give one for each")
     if not _is_whole(term.hidden) or term.hidden < 0:
@@ -63,10 +84,8 @@ def check_randomized(
         raise ValueError(f"{where}: the task has no number {shown(place)}; {nearest(place, known) or 'it has none'}")
     count = entries[name].places[own]
     numbers = flat(f"{where}.{place}", [value] * count if fill else value, count)
-    try:
+    with placed(f"{where}.{place}"):
         entries[name].check_numbers(own, numbers)
-    except ValueError as error:
-        raise ValueError(f"{where}.{place}: {error}") from error
 
 
 def _is_number(value: Any) -> bool:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from shared_store.contract.error_text import nearest
 from worker.settings.task import TaskConfig
 from worker.simulation.robot_view import RobotView
+from worker.tasks.compile.declaration_checks import placed
 from worker.tasks.declare.declaration import Declaration
 
 if TYPE_CHECKING:
@@ -37,19 +38,17 @@ def cameras(
             what = no_camera if image.sensor in sensors else f"there is no camera {image.sensor!r}"
             raise ValueError(f"observations.{group}: {what}; {there}")
     for name in known:
-        try:
+        with placed(f"sensors.{name}"):
             sensors[name].rows(views)
-        except ValueError as error:
-            raise ValueError(f"sensors.{name}: {error}") from error
     return {group: image.sensor for group, image in declaration.images.items()}
 
 
 def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
     """Refuse image groups that the configuration does not declare: submission checks jobs against it."""
-    told, kind = config.observation_groups, type(config).__name__
+    groups, kind = config.observation_groups, type(config).__name__
     there = [*declaration.groups, *declaration.images]
     for group in declaration.images:
-        if not told.get(group, False):
+        if not groups.get(group, False):
             raise ValueError(
                 f"observations.{group}: it is an image, and {kind} does not say so; give {kind} a "
                 f'further_groups: ClassVar = {{"{group}": True}}'

@@ -89,6 +89,11 @@ class Numbers:
         self.places[place] = (first, count)
         return first
 
+    def pair(self, first: int) -> tuple[float, float]:
+        """The two numbers from index ``first`` on."""
+        least, greatest = self.values[first : first + 2]
+        return least, greatest
+
     def _checked(self, shown_place: str, place: str, value: Any, count: int) -> list[float]:
         numbers = flat(shown_place, value, count)
         complaint = self._checks[place](numbers) if place in self._checks else None

@@ -15,7 +15,7 @@ def group_function(source: Source, group: str, terms: list[Seen]) -> str:
     own = (
         "world: int, fresh: bool, commit: bool, out: wp.array2d[wp.float32], now: wp.array2d[wp.float32], "
         "given: wp.uint32, numbers: wp.array[wp.float32], indices: wp.array[wp.int32], "
-        "past: wp.array2d[wp.float32], external: wp.array2d[wp.float32], seconds: float, "
+        "past: wp.array2d[wp.float32], external: ExternalArrays, seconds: float, "
         "worlds: WorldArrays, episodes: EpisodeArrays"
     )
     lines = ["stream = given"] if source.group_draws(group) else []
@@ -29,7 +29,7 @@ def _term(source: Source, seen: Seen) -> list[str]:
     lines = _draw_delay(seen) if seen.past >= 0 else []
     if signature is None:
         for column in range(bound.width):
-            lines += [f"x = external[world, {bound.external + column}]", *_column(seen, str(column))]
+            lines += [f"x = external.values[world, {bound.external + column}]", *_column(seen, str(column))]
         return lines
 
     def use(call: str) -> list[str]:
@@ -61,15 +61,13 @@ def _column(seen: Seen, column: str) -> list[str]:
     lines = []
     if seen.offset:
         lines += [f"x = x - {seen.offset.at(column)}"]
-    if seen.noise:
-        draw = "wp.randn(stream)" if seen.normal else "wp.randf(stream, -1.0, 1.0)"
-        lines += [f"x = x + {seen.noise.at(column)} * {draw}"]
+    for noise in seen.noises:
+        draw = "wp.randn(stream)" if noise.normal else "wp.randf(stream, -1.0, 1.0)"
+        lines += [f"x = x + {noise.amounts.at(column)} * {draw}"]
     if seen.clip is not None:
         lines += [f"x = wp.clamp(x, numbers[{seen.clip}], numbers[{seen.clip + 1}])"]
     if seen.scale:
         lines += [f"x = x * {seen.scale.at(column)}"]
-    if seen.blur:
-        lines += [f"x = x + {seen.blur.at(column)} * wp.randn(stream)"]
     if seen.past >= 0:
         lines += _delay(seen, column)
     return lines + _history(seen, column)

@@ -7,15 +7,22 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from shared_store.contract.error_text import nearest
+from shared_store.contract.error_text import nearest, shown
 from worker.settings.task import TaskConfig
 from worker.simulation.actuators import Input
 from worker.simulation.patterns import resolve
 from worker.simulation.robot_view import RobotView
 from worker.tasks.compile.acting import check_action, check_driven
 from worker.tasks.compile.binding import Binder, Bound
+from worker.tasks.compile.configured import deviations
 from worker.tasks.compile.contract import described
-from worker.tasks.compile.declaration_checks import check_command, check_observation, check_randomized
+from worker.tasks.compile.declaration_checks import (
+    check_command,
+    check_observation,
+    check_randomized,
+    check_result,
+    placed,
+)
 from worker.tasks.compile.images import cameras
 from worker.tasks.compile.numbers import are_times, flat, in_order, is_amount
 from worker.tasks.declare.declaration import (
@@ -28,7 +35,6 @@ from worker.tasks.declare.declaration import (
     Observation,
     Term,
 )
-from worker.tasks.declare.interface import deviations
 
 JUDGED = {"terminated": "terminated"}
 DRAWN = {"stream": "stream"}
@@ -49,6 +55,14 @@ class Column:
 
 
 @dataclass
+class Noise:
+    """Noise on the columns of a term: half the width of a uniform one, or the deviation of a normal one."""
+
+    amounts: Column
+    normal: bool
+
+
+@dataclass
 class Seen:
     """An observation term in its group.
 
@@ -56,10 +70,9 @@ class Seen:
         bound: The term.
         names: Of the columns of one step.
         first: Its first column in the group.
-        scale, offset, noise, clip: Numbers; None: not applied.
-        normal: Whether noise is normal; else uniform.
+        scale, offset, clip: Numbers; None: not applied.
+        noises: Its own noise, and that of ``config.randomize.observation_noise``.
         past: First column of the memory for its delay, -1 without one.
-        blur: Standard deviations of the noise that ``config.randomize.observation_noise`` adds to what the policy sees.
     """
 
     bound: Bound
@@ -67,11 +80,9 @@ class Seen:
     first: int
     scale: Column | None
     offset: Column | None
-    noise: Column | None
+    noises: list[Noise]
     clip: int | None
-    normal: bool
     past: int
-    blur: Column | None = None
 
     @property
     def term(self) -> Observation:
@@ -99,25 +110,17 @@ class Driven:
 
 
 @dataclass
-class Told:
-    """A command: its own term and the update of each step, its first column in memory, the column that counts its remaining
-    control steps, and the bounds of its duration.
+class Timed:
+    """A command or an event, with the update of a command in each step.
+
+    ``countdown`` is the column in memory of the control steps that are left, ``seconds`` the first number of the bounds of its duration
+    [s]; -1: it is not repeated.
     """
-
-    bound: Bound
-    update: Bound | None
-    first: int
-    countdown: int
-    seconds: int
-
-
-@dataclass
-class Happening:
-    """An event; for one at intervals, the column in memory of its countdown and the numbers of its bounds [s]."""
 
     bound: Bound
     countdown: int = -1
     seconds: int = -1
+    update: Bound | None = None
 
 
 class KernelPlan:
@@ -154,12 +157,12 @@ class KernelPlan:
         self._reserve_commands()
         self._bind_actions()
         self.commands = [self._command(name, term) for name, term in declaration.commands.items()]
-        self.rewards = self._bind_rewards()
+        self.weights = self._weigh(config)
+        self.rewards = [self._bind("rewards", name, declaration.rewards[name], own=JUDGED) for name in self.weights]
         self.metrics = [self._bind("metrics", name, term, own=JUDGED) for name, term in declaration.metrics.items()]
         self.terminations = [self._bind("terminations", name, term) for name, term in declaration.terminations.items()]
         if "time_out" in declaration.terminations:
             raise ValueError("terminations.time_out: the clock's own has this name; choose another")
-        self.success = self._success(declaration.success)
         rules = {name: term for name, term in declaration.curricula.items() if isinstance(term, Curriculum)}
         self.curricula = [self._bind("curricula", name, term, own=DRAWN) for name, term in rules.items()]
         self.adaptive = {name: term for name, term in declaration.curricula.items() if isinstance(term, Adaptive)}
@@ -172,13 +175,19 @@ class KernelPlan:
             else:
                 self.numbers.set(place, value, "config.numbers")
         for place, points in config.curriculum.items():
-            if "." in place:  # else a reward's weight, or the level
+            if "." in place:
                 self._check_course(place, [value for _, value in points], "config.curriculum")
+            elif place != "level" and place not in self.weights:
+                near = nearest(place, ["level", *self.weights])
+                raise ValueError(f"config.curriculum.{place}: there is no such term; {near}")
         for name, rule in self.adaptive.items():
             self._check_course(rule.place, [rule.start, rule.end], f"curricula.{name}")
-        self._blur(config.randomize.observation_noise)
+        self._add_noise(config.randomize.observation_noise)
         if critic := self._exact():
             self.groups["critic"] = critic
+        self.external = 0
+        self._place_torch_terms()
+        self.success, self.external_success = self._success(declaration.success)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -196,10 +205,9 @@ class KernelPlan:
         """Every bound term."""
         yield from (each.bound for each in self.driven)
         yield from [self.choice] if self.choice else []
-        for told in self.commands:
-            yield from [told.bound, *([told.update] if told.update else [])]
+        for timed in (*self.commands, *self.events):
+            yield from [timed.bound, *([timed.update] if timed.update else [])]
         yield from (*self.rewards, *self.metrics, *self.terminations, *self.curricula)
-        yield from (each.bound for each in self.events)
         for group in self.groups.values():
             yield from (seen.bound for seen in group)
 
@@ -208,16 +216,43 @@ class KernelPlan:
         check_result(bound, section)
         return bound
 
-    def _success(self, name: str | None) -> str | None:
-        """Whether the last step was a success, as an expression of the kernel. Raises ValueError for an unknown name."""
-        metrics, ends = list(self.declaration.metrics), list(self.declaration.terminations)
+    def in_warp(self, section: str) -> list[Bound]:
+        """The rewards, metrics or terminations that are Warp functions."""
+        bounds: list[Bound] = getattr(self, section)
+        return [bound for bound in bounds if bound.signature is not None]
+
+    @property
+    def in_torch(self) -> list[Bound]:
+        """The torch terms, each once: the observations, then the judged ones."""
+        seen = {seen.bound.place: seen.bound for group in self.groups.values() for seen in group}
+        return [
+            bound
+            for bound in (*seen.values(), *self.rewards, *self.metrics, *self.terminations)
+            if bound.signature is None
+        ]
+
+    def _place_torch_terms(self) -> None:
+        """Give the results of torch terms their columns; only those of observations are part of the kernels' source."""
+        for bound in self.in_torch:
+            bound.external, self.external = self.external, self.external + bound.width
+
+    def _success(self, name: str | None) -> tuple[str | None, int]:
+        """Whether the last step was a success, as an expression of the kernel, or as a column of the torch terms.
+
+        Raises:
+            ValueError: The name is unknown.
+        """
         if name is None:
-            return None
-        if name in metrics:
-            return f"total_{len(self.rewards) + metrics.index(name)} > 0.0"
-        if name in ends:
-            return f"ended_{ends.index(name)}"
-        raise ValueError(f"success: no metric and no termination is called {name}; {nearest(name, [*metrics, *ends])}")
+            return None, -1
+        bound = next((each for each in (*self.metrics, *self.terminations) if each.name == name), None)
+        if bound is None:
+            known = [*self.declaration.metrics, *self.declaration.terminations]
+            raise ValueError(f"success: no metric and no termination is called {name}; {nearest(name, known)}")
+        if bound.signature is None:
+            return None, bound.external
+        if bound in self.metrics:
+            return f"total_{len(self.in_warp('rewards')) + self.in_warp('metrics').index(bound)} > 0.0", -1
+        return f"ended_{self.in_warp('terminations').index(bound)}", -1
 
     def _check_course(self, place: str, values: list[float], where: str) -> None:
         """Refuse an unknown place, or a value that is invalid for any of its numbers."""
@@ -271,42 +306,49 @@ class KernelPlan:
             return Column(self.numbers.add(place, value, 1), False)
         return Column(self.numbers.add(place, value, len(names)), True)
 
-    def _command(self, name: str, term: Command) -> Told:
+    def _command(self, name: str, term: Command) -> Timed:
         first, place = self.binder.commands[name], f"commands.{name}"
-        own = {"command": str(first), "stream": "stream"}
+        own = {"command": str(first), **DRAWN}
         bound = self._bind("commands", name, term, element=False, own=own)
         update = None
         if term.update is not None:
             update = self._bind("commands", f"{name}.update", term.update, element=False, own=own)
-            self.binder.check_told(update, name)
-        countdown = first + self.binder.told[name] + self.binder.hidden[name]
+            self.binder.check_command(update, name)
+        countdown = first + self.binder.visible[name] + self.binder.hidden[name]
         seconds = self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times)
-        return Told(bound, update, first, countdown, seconds)
+        return Timed(bound, countdown, seconds, update)
 
-    def _bind_rewards(self) -> list[Bound]:
-        weights, declared = self.config.rewards, self.declaration.rewards
-        kind = type(self.config).__name__
-        for name in declared:
-            if name not in weights:
-                raise ValueError(f"rewards.{name}: {kind}.rewards has no weight of this name; {nearest(name, weights)}")
-        for name in weights:
+    def _weigh(self, config: TaskConfig) -> dict[str, float]:
+        """The weight of each reward: that of ``config.rewards``, or else the one beside the term.
+
+        Terms come in the order of the settings that name them, then in that of the declaration.
+        """
+        given, declared = config.rewards, self.declaration.rewards
+        for name in given:
             if name not in declared:
-                raise ValueError(
-                    f"rewards: {kind} has a weight {name}, and the task declares no such term; {nearest(name, declared)}"
-                )
-        return [self._bind("rewards", name, declared[name], own=JUDGED) for name in weights]
+                near = nearest(name, declared) if declared else "it declares none"
+                raise ValueError(f"config.rewards.{name}: the task has no term {shown(name)}; {near}")
+        if not declared:
+            raise ValueError("rewards: there is none; declare one, such as Reward(terms.alive, weight=1.0)")
+        names = [*config.default_weights, *(name for name in declared if name not in config.default_weights)]
+        found = {name: given.get(name, declared[name].weight) for name in names}
+        for name, weight in found.items():
+            if weight is None:
+                raise ValueError(f"rewards.{name}: it has no weight; give it one, such as Reward(…, weight=-1.0)")
+            flat(f"rewards.{name}.weight", weight, 1)
+        return {name: float(weight) for name, weight in found.items() if weight is not None}
 
-    def _event(self, name: str, term: Event) -> Happening:
+    def _event(self, name: str, term: Event) -> Timed:
         place = f"events.{name}"
         bound = self._bind("events", name, term, own=DRAWN)
         if term.when not in ("reset", "interval", "startup"):
             raise ValueError(f"{place}: when is {term.when!r}; it is reset, interval or startup")
         if term.when != "interval":
-            return Happening(bound)
+            return Timed(bound)
         if term.seconds is None:
             raise ValueError(f"{place}: an interval needs seconds=(least, greatest), above 0")
         column, self.binder.memory = self.binder.memory, self.binder.memory + 1
-        return Happening(bound, column, self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times))
+        return Timed(bound, column, self.numbers.add(f"{place}.seconds", term.seconds, 2, are_times))
 
     def _group(self, group: str, terms: Mapping[str, Observation]) -> list[Seen]:
         if not terms:
@@ -337,53 +379,32 @@ class KernelPlan:
         offset = (
             self._columns(f"{place}.offset", value, names) if isinstance(value, list | tuple) or value != 0.0 else None
         )
-        noise = None
+        noises = []
         if noisy and term.noise != 0.0:
-            noise = Column(self.numbers.add(f"{place}.noise", term.noise, 1, is_amount), False)
+            amount = self.numbers.add(f"{place}.noise", term.noise, 1, is_amount)
+            noises.append(Noise(Column(amount, False), term.noise_kind == "normal"))
         clip = self.numbers.add(f"{place}.clip", term.clip, 2, in_order) if term.clip is not None else None
-        return Seen(bound, names, first, scale, offset, noise, clip, term.noise_kind == "normal", past)
+        return Seen(bound, names, first, scale, offset, noises, clip, past)
 
-    def _blur(self, noise: float | Mapping[str, float]) -> None:
+    def _add_noise(self, noise: float | Mapping[str, float]) -> None:
         """Add the noise of the configuration to the policy's measured terms."""
         if not noise:
             return
         columns = [column for seen in self.groups["policy"] for column in described(self, seen)]
-        try:
-            found = deviations(noise, tuple(columns))
-        except ValueError as error:
-            raise ValueError(f"config.randomize.observation_noise: {error}") from error
+        with placed("config.randomize.observation_noise"):
+            found = deviations(noise, columns)
         for seen in self.groups["policy"]:
             mine, found = found[: len(seen.names)], found[len(seen.names) :]
             if any(mine):
                 place = f"randomize.observation_noise.{seen.bound.name}"
-                seen.blur = Column(self.numbers.add(place, mine, len(mine)), True)
+                seen.noises.append(Noise(Column(self.numbers.add(place, mine, len(mine)), True), True))
 
     def _exact(self) -> list[Seen] | None:
         """The critic's terms if none are declared: the policy's without noise and delay; None: these equal the policy's."""
         policy = self.groups["policy"]
-        if "critic" in self.groups or not any(seen.noise or seen.blur or seen.past >= 0 for seen in policy):
+        if "critic" in self.groups or not any(seen.noises or seen.past >= 0 for seen in policy):
             return None
-        return [dataclasses.replace(seen, noise=None, blur=None, past=-1) for seen in policy]
-
-
-def check_result(bound: Bound, section: str) -> None:
-    """Refuse a function whose result its section can't use."""
-    if bound.signature is None:
-        if section in ("events", "commands", "actions", "curricula"):
-            raise ValueError(
-                f"{bound.place}: a torch term observes, rewards or ends an episode; write this one as a @wp.func"
-            )
-        if section in ("rewards", "metrics", "terminations") and bound.width != 1:
-            raise ValueError(f"{bound.place}: size is {bound.width}; a term of this section gives one number a world")
-        return
-    returns = bound.signature.returns
-    name = bound.signature.name
-    if section in ("rewards", "metrics") and (returns is None or bound.width != 1):
-        raise ValueError(f"{bound.place}: {name} must give a float (-> float), one number a world or element")
-    if section == "terminations" and returns is not bool:
-        raise ValueError(f"{bound.place}: {name} must give a bool (-> bool): whether the episode ends")
-    if section.startswith("observations") and returns is None:
-        raise ValueError(f"{bound.place}: {name} gives nothing; annotate its result, such as -> float")
+        return [dataclasses.replace(seen, noises=[], past=-1) for seen in policy]
 
 
 def column_names(place: str, name: str, term: Observation, bound: Bound) -> list[str]:
@@ -414,10 +435,8 @@ def by_pattern(place: str, values: Mapping[str, float], names: list[str]) -> lis
     Raises:
         ValueError: A pattern fits no name, or a name has no pattern.
     """
-    try:
+    with placed(place):
         found: list[float | None] = resolve(names, values, "column")
-    except ValueError as error:
-        raise ValueError(f"{place}: {error}") from error
     lacking = [name for name, value in zip(names, found, strict=True) if value is None]
     if lacking:
         raise ValueError(f"{place}: no pattern fits {lacking[0]}; add one, such as '*'")

@@ -7,23 +7,20 @@ from typing import Any
 
 import warp as wp
 
-from worker.simulation import episodes as episode_functions
+from worker.simulation import episodes, worlds
 from worker.simulation.episodes import EpisodeArrays
-from worker.simulation.worlds import WorldArrays, is_sound, restore_start
+from worker.simulation.worlds import WorldArrays
+from worker.tasks.compile import external
 from worker.tasks.compile.binding import Bound
+from worker.tasks.compile.external import ExternalArrays
 from worker.tasks.compile.plan import KernelPlan
 
-_OURS = (
-    "STEP",
-    "TERMINATED",
-    "TERMS",
-    "add_reward",
-    "begin_episode",
-    "clear_row",
-    "end_step",
-    "numbered_stream",
-    "random_stream",
-)
+_OURS = {
+    episodes: ("STEP", "add_reward", "begin_episode", "clear_row", "end_step", "numbered_stream", "random_stream"),
+    external: ("add_metric", "count_end", "count_external_ends", "external_end", "judge_external"),
+    worlds: ("is_sound", "restore_start"),
+}
+"""Functions that every generated source may call, by module."""
 
 
 class Source:
@@ -53,24 +50,14 @@ class Source:
 
     def group_draws(self, group: str) -> bool:
         """Whether a group's observations draw random numbers: noise, delays, terms with a stream."""
-        return any(
-            seen.noise or seen.blur or seen.past >= 0 or seen.bound.takes("stream") for seen in self.plan.groups[group]
-        )
+        return any(seen.noises or seen.past >= 0 or seen.bound.takes("stream") for seen in self.plan.groups[group])
 
     def scope(self) -> dict[str, Any]:
         """All names in the source."""
-        ours = {name: getattr(episode_functions, name) for name in _OURS}
+        ours = {name: getattr(module, name) for module, names in _OURS.items() for name in names}
         types = {_type_name(variable): kind for variable, kind in self.plan.binder.structs.items()}
-        return {
-            "wp": wp,
-            "WorldArrays": WorldArrays,
-            "EpisodeArrays": EpisodeArrays,
-            "is_sound": is_sound,
-            "restore_start": restore_start,
-            **ours,
-            **types,
-            **self._functions,
-        }
+        types |= {"WorldArrays": WorldArrays, "EpisodeArrays": EpisodeArrays, "ExternalArrays": ExternalArrays}
+        return {"wp": wp, **ours, **types, **self._functions}
 
 
 def _type_name(variable: str) -> str:
@@ -91,7 +78,7 @@ def calls(source: Source, bound: Bound, use: Callable[[str], list[str]]) -> list
         use: Lines that use the call, given as an expression.
     """
     if bound.signature is None:
-        return use(f"external[world, {bound.external}]")
+        return use(f"external.values[world, {bound.external}]")
     call = call_of(source, bound)
     return use(call) if bound.elements is None else loop(source, bound, use(call))
 

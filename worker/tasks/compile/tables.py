@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 from worker.settings.overrides import training_sections
 from worker.tasks.compile.acting import frame_of
 from worker.tasks.compile.binding import Bound
-from worker.tasks.compile.contract import value_of
 from worker.tasks.compile.images import shown
 from worker.tasks.declare.declaration import Adaptive, Choice, Event, Reward, Termination
 
 if TYPE_CHECKING:
-    from worker.tasks.compile.plan import KernelPlan, Seen
+    from worker.tasks.compile.plan import Column, KernelPlan, Seen
 
 Row = dict[str, str]
 _ELSEWHERE = {"rewards", "randomize", "numbers", "curriculum"}
@@ -43,12 +42,12 @@ def tables(plan: KernelPlan) -> dict[str, list[Row]]:
         of = "metric" if plan.declaration.success in plan.declaration.metrics else "termination"
         found["success"] = [{of: plan.declaration.success}]
     found["commands"] = [
-        _term(plan, told.bound)
+        _term(plan, command.bound)
         | {
-            "numbers": ", ".join(plan.declaration.commands[told.bound.name].names),
-            "every": _seconds(plan, told.seconds),
+            "numbers": ", ".join(plan.declaration.commands[command.bound.name].names),
+            "every": _seconds(plan, command.seconds),
         }
-        for told in plan.commands
+        for command in plan.commands
     ]
     found["events"] = [
         _term(plan, event.bound)
@@ -136,8 +135,8 @@ def _actions(plan: KernelPlan) -> list[Row]:
             _term(plan, driven.bound)
             | {
                 "joints": ", ".join(_joints(plan, driven.bound)),
-                "scale": _spread(value_of(plan, driven.scale, index, 1.0) for index in range(count)),
-                "offset": _spread(value_of(plan, driven.offset, index, 0.0) for index in range(count)),
+                "scale": _spread(plan, driven.scale, count),
+                "offset": _spread(plan, driven.offset, count),
             }
         )
     return rows
@@ -153,14 +152,16 @@ def _joints(plan: KernelPlan, bound: Bound) -> list[str]:
 
 def _observation(plan: KernelPlan, seen: Seen) -> Row:
     count = len(seen.names)
-    noise = _spread(value_of(plan, seen.noise, index, 0.0) for index in range(count)) if seen.noise else ""
-    clip = [plan.numbers.values[seen.clip], plan.numbers.values[seen.clip + 1]] if seen.clip is not None else None
+    noises = [
+        f"{'normal' if noise.normal else 'uniform'} {_spread(plan, noise.amounts, count)}" for noise in seen.noises
+    ]
+    clip = "" if seen.clip is None else _vector([*plan.numbers.pair(seen.clip)])
     least, greatest = seen.term.delay
     return _term(plan, seen.bound) | {
         "columns": str(seen.size),
-        "scale": _spread(value_of(plan, seen.scale, index, 1.0) for index in range(count)) if seen.scale else "",
-        "noise": f"{'normal' if seen.normal else 'uniform'} {noise}" if noise else "",
-        "clip": _vector(clip) if clip else "",
+        "scale": _spread(plan, seen.scale, count) if seen.scale else "",
+        "noise": ", ".join(noises),
+        "clip": clip,
         "delay": f"{least} to {greatest}" if greatest else "",
         "history": str(seen.term.history) if seen.term.history > 1 else "",
     }
@@ -169,9 +170,8 @@ def _observation(plan: KernelPlan, seen: Seen) -> Row:
 def _reward(plan: KernelPlan, bound: Bound) -> Row:
     term = bound.term
     assert isinstance(term, Reward)
-    weight = plan.config.rewards[bound.name]
     return (
-        {"name": bound.name, "weight": f"{weight:g}"}
+        {"name": bound.name, "weight": f"{plan.weights[bound.name]:g}"}
         | _term(plan, bound)
         | {"per": "second" if term.per_second else "step"}
     )
@@ -206,16 +206,16 @@ def _vector(values: list[float]) -> str:
     return f"{values[0]:g}" if len(values) == 1 else f"[{', '.join(f'{value:g}' for value in values)}]"
 
 
-def _spread(values: Iterator[float]) -> str:
-    """One number for all columns, or the least and the greatest."""
-    found = sorted(set(values))
+def _spread(plan: KernelPlan, column: Column, count: int) -> str:
+    """The number of all ``count`` columns, or the least and the greatest of them."""
+    found = plan.numbers.values[column.first : column.first + (count if column.each else min(count, 1))]
     if not found:
         return ""
-    return f"{found[0]:g}" if len(found) == 1 else f"{found[0]:g} to {found[-1]:g}"
+    return f"{found[0]:g}" if min(found) == max(found) else f"{min(found):g} to {max(found):g}"
 
 
 def _seconds(plan: KernelPlan, first: int) -> str:
-    least, greatest = plan.numbers.values[first : first + 2]
+    least, greatest = plan.numbers.pair(first)
     return f"{least:g} s" if least == greatest else f"{least:g} to {greatest:g} s"
 
 

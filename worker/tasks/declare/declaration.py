@@ -1,4 +1,4 @@
-"""The parts of a declared task: named terms for actions, observations, rewards, terminations, commands, events and curricula.
+"""The declaration of a task: named terms for actions, observations, rewards, terminations, commands, events and curricula.
 
 A term is a small Warp function with annotated parameters, see :mod:`worker.tasks.declare.functions`. Its numbers are data: a change
 compiles nothing, and a job's YAML sets them under ``train.config.numbers`` by their place, such as
@@ -8,12 +8,13 @@ compiles nothing, and a job's YAML sets them under ``train.config.numbers`` by t
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from shared_store.contract.policy import Target
 from worker.simulation.declared_randomization import Randomize
+from worker.tasks.declare.adaptive import Adaptive as Adaptive
 
 Pattern = str | Sequence[str]
 """Names of joints, bodies or sites, one or several, with ``*`` for any letters; they are selected in the order of the model."""
@@ -23,7 +24,8 @@ class Term:
     """A function, the elements that it is applied to, and its numbers.
 
     Args:
-        function: A ``@wp.func``; or a Python function ``(task, **parameters) -> torch.Tensor``, whose launches are captured.
+        function: A ``@wp.func``; or a Python function ``(task, **parameters) -> torch.Tensor``, whose launches are captured. A parameter
+            ``joints``, ``bodies`` or ``sites`` of such a function gets the indices of what the term selects, as a tensor.
         robot: Name of the robot or object to which ``RobotArrays`` and patterns refer.
         joints: The joints, for a function with a parameter ``joint``.
         bodies: The bodies, for a function with a parameter ``body``.
@@ -64,19 +66,27 @@ class Term:
 
 
 class Reward(Term):
-    """A term of the reward, a float, summed over its elements; its weight is in ``config.rewards`` under its name.
+    """A term of the reward, a float, summed over its elements.
 
     Args:
         function: As for :class:`Term`.
+        weight: Its factor, negative for a cost; a number of the same name in ``config.rewards`` takes its place.
         per_second: Multiply by the length of the control step [s].
         unless_terminated: The term is 0 in a step in which a termination ends the episode.
         **options: As for :class:`Term`.
     """
 
     def __init__(
-        self, function: Any, *, per_second: bool = False, unless_terminated: bool = False, **options: Any
+        self,
+        function: Any,
+        *,
+        weight: float | None = None,
+        per_second: bool = False,
+        unless_terminated: bool = False,
+        **options: Any,
     ) -> None:
         super().__init__(function, **options)
+        self.weight = weight
         self.per_second, self.unless_terminated = per_second, unless_terminated
 
 
@@ -172,54 +182,6 @@ class Curriculum(Term):
 
     It keeps its state in ``lasting`` numbers.
     """
-
-
-@dataclass(frozen=True)
-class Adaptive:
-    """A number that adapts to the policy's performance: the same in all worlds of all ranks, and part of a run's state.
-
-    Before each iteration it goes one step from ``start`` towards ``end`` if the mean of the episodes that ended last is above
-    ``above``, and one step back if it is below ``below``. An evaluation of a checkpoint uses the training's value.
-
-    Args:
-        place: Place of the number, such as ``events.push.speed``; at a place with several numbers, all change.
-        start: Its first value.
-        end: Its last value.
-        steps: Number of steps between the two.
-        above: Mean above which it takes a step forward.
-        below: Mean below which it takes a step back; None: never.
-        of: The quantity of the mean, ``"return"`` or ``"length"`` [steps].
-    """
-
-    place: str
-    start: float
-    end: float
-    steps: int = 20
-    above: float = 0.0
-    below: float | None = None
-    of: Literal["return", "length"] = "return"
-
-    def __post_init__(self) -> None:
-        if self.steps < 1:
-            raise ValueError(f"Adaptive of {self.place}: steps is {self.steps}; use 1 or more")
-        if self.below is not None and self.below >= self.above:
-            raise ValueError(
-                f"Adaptive of {self.place}: below is {self.below}, which must be less than above, {self.above}"
-            )
-        if self.of not in ("return", "length"):
-            raise ValueError(f"Adaptive of {self.place}: of is {self.of!r}; it is return or length")
-
-    def after(self, step: float, reward: float | None, episode_length: float | None) -> float:
-        """The step, from 0 to :attr:`steps`, that follows ``step``."""
-        mean = reward if self.of == "return" else episode_length
-        if mean is None:
-            return step
-        moved = step + (mean > self.above) - (self.below is not None and mean < self.below)
-        return min(max(moved, 0.0), float(self.steps))
-
-    def value(self, step: float) -> float:
-        """The number at a step."""
-        return self.start + (self.end - self.start) * step / self.steps
 
 
 class Observation(Term):
@@ -345,7 +307,7 @@ class Declaration:
     Without a group ``critic``, the critic sees the policy's observations without noise and delay. An :class:`Image` group must also be
     named in the configuration's ``further_groups``; if ``policy`` is an image, ``critic`` has the terms."""
     rewards: Mapping[str, Reward]
-    """One for each name in ``config.rewards``."""
+    """Terms of the reward, at least one; each has a weight, beside it or in ``config.rewards``."""
     terminations: Mapping[str, Termination] = field(default_factory=dict)
     """Ends of an episode other than the clock."""
     commands: Mapping[str, Command] = field(default_factory=dict)
@@ -372,10 +334,7 @@ class Declaration:
             for group, terms in entries.items():
                 for name, term in terms.items():
                     where = ".".join(filter(None, (section, group, str(name))))
-                    if not isinstance(name, str) or not NAME.fullmatch(name):
-                        raise ValueError(
-                            f"{where}: a term's name has small letters, digits and underscores, and begins with a letter"
-                        )
+                    _check_name(where, name)
                     if isinstance(term, Image):
                         raise ValueError(
                             f'observations.{name}: an Image is a group of its own; write observations={{"policy": {{…}}, "{name}": …}}'
@@ -383,18 +342,15 @@ class Declaration:
                     if section == "curricula" and isinstance(term, Adaptive):
                         continue
                     if not isinstance(term, kind):
-                        raise ValueError(f"{where}: expected {_a(kind.__name__)}, found {_a(type(term).__name__)}")
+                        raise ValueError(f"{where}: expected {_a(kind.__name__)}, found {a_type(term)}")
         for name, entry in self.randomize.items():
             if not isinstance(entry, Randomize):
-                raise ValueError(f"randomize.{name}: expected a Randomize, found {_a(type(entry).__name__)}")
+                raise ValueError(f"randomize.{name}: expected a Randomize, found {a_type(entry)}")
         for name, sensor in self.sensors.items():
-            if not isinstance(name, str) or not NAME.fullmatch(name):
+            _check_name(f"sensors.{name}", name)
+            if isinstance(sensor, type) or not all(hasattr(sensor, each) for each in ("arrays_type", "rows", "build")):
                 raise ValueError(
-                    f"sensors.{name}: a name has small letters, digits and underscores, and begins with a letter"
-                )
-            if not all(hasattr(sensor, each) for each in ("arrays_type", "rows", "build")):
-                raise ValueError(
-                    f"sensors.{name}: expected a sensor, such as ContactSensor(...), found {_a(type(sensor).__name__)}"
+                    f"sensors.{name}: expected a sensor, such as ContactSensor(...), found {a_type(sensor)}"
                 )
         if "policy" not in self.groups:
             there = ", ".join(self.observations)
@@ -405,15 +361,16 @@ class Declaration:
             raise ValueError(f"observations: there is no group policy, only {there}")
 
     @property
-    def _nested(self) -> bool:
-        """Whether the observations are in several groups."""
-        return bool(self.observations) and all(isinstance(each, Mapping | Image) for each in self.observations.values())
+    def by_group(self) -> Mapping[str, Mapping[str, Observation] | Image]:
+        """The terms or the camera of each observation group; observations without groups are those of the policy."""
+        observations: Mapping[str, Any] = self.observations
+        nested = bool(observations) and all(isinstance(each, Mapping | Image) for each in observations.values())
+        return observations if nested else {"policy": observations}
 
     @property
     def groups(self) -> Mapping[str, Mapping[str, Observation]]:
         """The terms of each observation group that has terms; if the policy sees an image, the critic's terms are under ``policy``."""
-        nested: Mapping[str, Any] = self.observations if self._nested else {"policy": self.observations}
-        groups = {name: each for name, each in nested.items() if isinstance(each, Mapping)}
+        groups = {name: each for name, each in self.by_group.items() if isinstance(each, Mapping)}
         if "policy" in self.images and "critic" in groups:
             groups = {"policy": groups.pop("critic"), **groups}
         return groups
@@ -421,9 +378,7 @@ class Declaration:
     @property
     def images(self) -> Mapping[str, Image]:
         """The observation groups that are images."""
-        return (
-            {name: each for name, each in self.observations.items() if isinstance(each, Image)} if self._nested else {}
-        )
+        return {name: each for name, each in self.by_group.items() if isinstance(each, Image)}
 
 
 SECTIONS: Mapping[str, type[Term]] = {
@@ -438,12 +393,20 @@ SECTIONS: Mapping[str, type[Term]] = {
 }
 """The sections of a declaration and the types of their terms."""
 
-TorchFunction = Callable[..., Any]
+
+def _check_name(where: str, name: Any) -> None:
+    if not isinstance(name, str) or not NAME.fullmatch(name):
+        raise ValueError(f"{where}: a name has small letters, digits and underscores, and begins with a letter")
 
 
 def _several(names: Any) -> tuple[Any, ...]:
     """Names as a tuple; a single name becomes a tuple of one."""
     return tuple(names) if isinstance(names, Sequence) and not isinstance(names, str) else (names,)
+
+
+def a_type(value: Any) -> str:
+    """The type of a value, for errors: ``"an Event"``; of a class: ``"the class Event"``."""
+    return f"the class {value.__name__}" if isinstance(value, type) else _a(type(value).__name__)
 
 
 def _a(name: str) -> str:

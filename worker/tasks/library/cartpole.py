@@ -13,7 +13,7 @@ from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks import terms
 from worker.tasks.declare.declaration import Action, Declaration, Event, Observation, Reward, Termination
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,7 +42,7 @@ def effort(world: int, episodes: EpisodeArrays, action: int) -> float:
     return felt * felt
 
 
-class Cartpole(DeclaredTask):
+class Cartpole(Task):
     """Cart and pole: 4 observations, 1 action, 60 control steps a second, episodes of 5 s."""
 
     config_type = CartpoleConfig

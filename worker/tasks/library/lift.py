@@ -23,7 +23,7 @@ from worker.tasks.declare.declaration import (
     Termination,
 )
 from worker.tasks.library.robots.yam import ACTION_SCALE, FINGERTIPS, GRASP, GRIPPER, yam
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 EDGE = 0.04
 """Length of the cube's edges [m]."""
@@ -35,7 +35,7 @@ FINGERTIP_FRICTION: tuple[tuple[str, str, tuple[float, float], Distribution], ..
 """Sliding, torsional [m] and rolling [m] coefficients of each fingertip sphere, drawn once for each world."""
 
 
-class LiftCube(DeclaredTask):
+class LiftCube(Task):
     """The YAM arm and a cube: 29 observations, 7 actions, 50 control steps a second, episodes of 20 s."""
 
     config_type = LiftCubeConfig

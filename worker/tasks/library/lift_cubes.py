@@ -42,7 +42,7 @@ class LiftCubes(LiftCube):
         return {f"cube_{index}": dataclasses.replace(cube, color=color) for index, color in enumerate(colors)}
 
     def build(self, builder: newton.ModelBuilder) -> None:
-        """As :meth:`DeclaredTask.build`; the solver has room for the contacts of all cubes."""
+        """As :meth:`Task.build`; the solver has room for the contacts of all cubes."""
         super().build(builder)
         config: Any = self.config
         options = type(self).solver_options

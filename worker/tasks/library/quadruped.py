@@ -24,7 +24,7 @@ from worker.tasks.declare.declaration import (
     Reward,
     Termination,
 )
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -68,7 +68,7 @@ def vertical_velocity_squared(world: int, worlds: WorldArrays, robot: RobotArray
     return velocity * velocity
 
 
-class Quadruped(DeclaredTask):
+class Quadruped(Task):
     """``quadruped.xml`` beside this file: 48 observations, 12 actions, 50 control steps a second, episodes of 20 s."""
 
     config_type = QuadrupedConfig

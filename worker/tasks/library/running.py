@@ -15,7 +15,7 @@ from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.worlds import WorldArrays
 from worker.tasks import terms
 from worker.tasks.declare.declaration import Action, Declaration, Event, Observation, Reward, Termination
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 wp.set_module_options({"enable_backward": False})
 
@@ -82,7 +82,7 @@ def place(
         worlds.joint_qd[world, robot.dofs[joint]] = velocity * wp.randf(stream, -1.0, 1.0)
 
 
-class Running(DeclaredTask):
+class Running(Task):
     """A robot of one of Newton's bundled MJCF files that runs; a subclass names the file and sets its numbers."""
 
     ground = True

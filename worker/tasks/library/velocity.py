@@ -34,7 +34,7 @@ from worker.tasks.declare.declaration import (
     Term,
     Termination,
 )
-from worker.tasks.run.declared import DeclaredTask
+from worker.tasks.run.task import Task
 
 COMMANDED = ("forward", "left", "turn")
 """The commanded velocities; each has stages in the configuration, such as ``command_forward``."""
@@ -82,7 +82,7 @@ class Walker:
         return len(self.ring.points())
 
 
-class Velocity(DeclaredTask):
+class Velocity(Task):
     """A robot that follows velocity commands; a subclass names the robot, its ground, and further terms on rough ground."""
 
     ground = True
@@ -100,7 +100,7 @@ class Velocity(DeclaredTask):
         return Terrain() if self.rough else None
 
     def build(self, builder: newton.ModelBuilder) -> None:
-        """As :meth:`DeclaredTask.build`; the limits of the solver are those of the configuration.
+        """As :meth:`Task.build`; the limits of the solver are those of the configuration.
 
         Raises:
             ValueError: ``config.numbers`` names a range that the stages of a command set in each iteration.

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
-import warp as wp
 
 from shared_store.volume.evaluations import BY_CLOCK
 from worker.simulation.episodes import PHYSICS_FAILED, STEPS, TERMS
 
 if TYPE_CHECKING:
+    from worker.tasks.run.buffers import Buffers
     from worker.tasks.run.task import Task
 
 CLOCK = "time_out"
@@ -27,8 +27,7 @@ class LastEpisodes:
             ``(worlds, 2 + terms)``, float32.
         causes: Index into ``names`` of the cause of its end, shape ``(worlds,)``, int32. Of several terminations in one step, the first.
         judged: Whether it was a success by the task's criterion, shape ``(worlds,)``, bool; meaningless if ``success`` is None.
-        names: Causes of an end: the clock (``time_out``), ``physics_failed``, ``terminated`` (by kernels written by hand), then
-            the terminations of a declared task.
+        names: Causes of an end: the clock (``time_out``), ``physics_failed``, ``terminated`` (none of the next), then the terminations.
         columns: Names of the columns of ``sums`` after the first two.
         success: The metric or termination that makes a success; None: only the clock ended the episode.
         says_success: Whether success is defined; without terminations and a criterion it is not.
@@ -45,15 +44,14 @@ class LastEpisodes:
     final: Sequence[str] = ()
 
     @classmethod
-    def of(cls, task: Task, buffer: Callable[[str, tuple[int, ...], Any], torch.Tensor]) -> LastEpisodes:
-        """The records of ``task``, in buffers that ``buffer`` allocates among its ``EpisodeArrays``: name, shape, Warp's type."""
-        count = task.world_count
+    def of(cls, task: Task, buffers: Buffers) -> LastEpisodes:
+        """The records of ``task`` in its buffers."""
         rewards = [f"reward_{name}" for name in task.reward_terms]
         ends = [name.removeprefix("termination_") for name in task.termination_names]
         return cls(
-            buffer("last_sums", (count, int(TERMS) + len(rewards) + len(task.metric_names)), wp.float32),
-            buffer("causes", (count,), wp.int32),
-            buffer("successes", (count,), wp.bool),
+            buffers["last_sums"],
+            buffers["causes"],
+            buffers["successes"],
             [CLOCK, "physics_failed", "terminated", *(name for name in ends if name != CLOCK)],
             [*rewards, *task.metric_names],
             task.success,

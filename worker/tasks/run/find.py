@@ -85,4 +85,6 @@ def find_task(name: str) -> type[Task]:
         raise ValueError(
             f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.run.task.Task; {there}"
         )
+    if found.changes and module_name == found.__module__:  # by with_, which knows no name
+        found.__name__ = found.__qualname__ = class_name
     return found

@@ -15,7 +15,6 @@ import torch
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from worker.simulation.episodes import ACTION_LIMIT
 from worker.tasks.run.find import BUILT_IN, find_task
 from worker.tasks.run.task import Task
 
@@ -74,7 +73,7 @@ class TaskVectorEnv(VectorEnv[Observations, np.ndarray, np.ndarray]):
         """Begin a new episode in every world.
 
         Args:
-            seed: The worlds become those of this seed, as if they had just been built; only the physics and scenes that
+            seed: The worlds become those of this seed, as if they had just been built; only the scenes that
                 ``config.randomize`` drew at the construction stay. None: their random streams continue.
             options: Not used by any task.
 
@@ -148,10 +147,7 @@ def _action_space(task: Task) -> gymnasium.Space[Any]:
     """The space of one world's actions."""
     if task.discrete:
         return gymnasium.spaces.Discrete(task.action_size)
-    interface = task.interface()
-    if interface is None:  # kernels written by hand
-        return gymnasium.spaces.Box(-float(ACTION_LIMIT), float(ACTION_LIMIT), (task.action_size,), np.float32)
-    limits = [action.clip or (-np.inf, np.inf) for action in interface.actions]
+    limits = [action.clip or (-np.inf, np.inf) for action in task.interface().actions]
     low, high = np.array(limits, np.float32).T
     return gymnasium.spaces.Box(low, high, dtype=np.float32)
 

@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from shared_store import __version__
 from shared_store.contract.policy import Command, Contract, Group, Image, RobotModel, State, Term
+from worker.settings.camera import CameraConfig
 from worker.tasks.compile.contract import described, range_of
 from worker.tasks.compile.measured import frame_of, is_library
 from worker.tasks.compile.tables import settings
 
 if TYPE_CHECKING:
-    from worker.simulation.robot_reading import Reading
     from worker.tasks.compile.plan import KernelPlan, Seen
     from worker.tasks.run.task import Task
-
-CHANNELS = ("red", "green", "blue")
-"""Name of the camera that the configuration adds to any task."""
 
 
 class Exported(Protocol):
@@ -47,16 +44,14 @@ def policy_contract(task: Task, name: str, exported: Exported | None = None) -> 
     if exported is not None:
         inputs = dict(zip(map(str, exported.sample.keys()), exported.inputs, strict=False))
         states = [State(each, f"{each}_out", tuple(exported.inputs[each].shape[1:])) for each in exported.states]
-    interface = task.interface()
-    actions = interface.actions if interface else ()
     return Contract(
         task=name,
         muster=__version__,
         control_hz=float(task.config.control_hz),
         groups=tuple(_group(task, group, each, groups[group]) for group, each in inputs.items()),
-        actions=tuple(actions),
+        actions=task.interface().actions,
         action_names=tuple(task.action_names),
-        commands=_commands(getattr(task, "plan", None)),
+        commands=_commands(task.plan),
         states=tuple(states),
         discrete=bool(task.discrete),
         robots=robots_of(task),
@@ -64,15 +59,9 @@ def policy_contract(task: Task, name: str, exported: Exported | None = None) -> 
     )
 
 
-def readings_of(task: Task) -> Mapping[str, Reading]:
-    """How the file of each robot of a task was read, by its name; a task of kernels by hand keeps none."""
-    readings: Mapping[str, Reading] = getattr(task, "readings", {})
-    return readings
-
-
 def robots_of(task: Task) -> tuple[RobotModel, ...]:
     """The robots of a task as they were loaded."""
-    return tuple(dataclasses.replace(reading.identity, name=name) for name, reading in readings_of(task).items())
+    return tuple(dataclasses.replace(reading.identity, name=name) for name, reading in task.readings.items())
 
 
 def _group(task: Task, name: str, given: str, shape: tuple[int, ...]) -> Group:
@@ -87,11 +76,8 @@ def _image(task: Task, group: str) -> Image | None:
     camera: dict[str, Any] = dict(images_of(task).get(group, {}))
     if not camera:
         return None
-    frames, channels = int(camera.pop("frames", 1)), camera.pop("channels", CHANNELS)
-    shown = tuple(
-        channels if channels is CHANNELS else channels[: len(channels) // frames]
-    )  # a sensor names the channels of all frames
-    return Image(shown, frames, _texts(camera))
+    frames, channels = int(camera.pop("frames", 1)), camera.pop("channels")
+    return Image(tuple(channels[: len(channels) // frames]), frames, _texts(camera))  # it names those of all frames
 
 
 def _texts(value: Any) -> Any:
@@ -105,9 +91,7 @@ def _texts(value: Any) -> Any:
 
 def _terms(task: Task, group: str) -> tuple[Term, ...]:
     """The terms of a group of numbers; none if unknown."""
-    plan: KernelPlan | None = getattr(task, "plan", None)
-    if plan is None:
-        return _columns(task) if group in ("policy", "critic") else ()
+    plan = task.plan
     # if the policy sees only an image, the plan has the critic's terms in its place
     there = "policy" if group == "critic" and (group not in plan.groups or "policy" in plan.images) else group
     first, found = 0, []
@@ -115,28 +99,6 @@ def _terms(task: Task, group: str) -> tuple[Term, ...]:
         found.append(_term(plan, seen, first))
         first += found[-1].size
     return tuple(found)
-
-
-def _columns(task: Task) -> tuple[Term, ...]:
-    """The observations of a task with hand-written kernels, each as a term: from its interface, or else with their names only."""
-    interface = task.interface()
-    if interface is None:
-        names = tuple(task.observation_names)
-        return tuple(Term(name, "measured", i, (name,), ("",), (1.0,), (0.0,)) for i, name in enumerate(names))
-    return tuple(
-        Term(
-            name=seen.name,
-            kind=seen.kind,
-            first=index,
-            names=(seen.name,),
-            units=(seen.unit,),
-            scale=(seen.scale,),
-            offset=(seen.offset,),
-            clip=seen.clip,
-            ranges=(seen.range,) if seen.kind == "command" else (),
-        )
-        for index, seen in enumerate(interface.observations)
-    )
 
 
 def _term(plan: KernelPlan, seen: Seen, first: int) -> Term:
@@ -179,16 +141,13 @@ def _sensor(declared: Any) -> str:
     return ", ".join(filter(None, (type(declared).__name__, settings(declared))))
 
 
-def _commands(plan: KernelPlan | None) -> tuple[Command, ...]:
-    if plan is None:
-        return ()
+def _commands(plan: KernelPlan) -> tuple[Command, ...]:
     found = []
-    for told in plan.commands:
-        name, command = told.bound.name, plan.declaration.commands[told.bound.name]
+    for timed in plan.commands:
+        name, command = timed.bound.name, plan.declaration.commands[timed.bound.name]
         ranges: Sequence[Any] = [range_of(plan, name, command, column) for column in command.names]
-        seconds = (plan.numbers.values[told.seconds], plan.numbers.values[told.seconds + 1])
-        drawn = (command.function_name, is_library(command))
-        found.append(Command(name, command.names, tuple(command.units), tuple(ranges), seconds, *drawn))
+        drawn = (plan.numbers.pair(timed.seconds), command.function_name, is_library(command))
+        found.append(Command(name, command.names, tuple(command.units), tuple(ranges), *drawn))
     return tuple(found)
 
 
@@ -198,21 +157,20 @@ def same_policy(contract: Contract, of: Contract) -> Contract:
     A task alone doesn't know these parts. They can't differ, since they follow from the settings with which a policy is loaded.
     """
     groups = []
-    for told in of.groups:
-        group = contract.group(told.name)
+    for former in of.groups:
+        group = contract.group(former.name)
         if group is not None:
-            groups.append(dataclasses.replace(group, input=told.input))
+            groups.append(dataclasses.replace(group, input=former.input))
     return dataclasses.replace(contract, groups=tuple(groups), states=of.states, normalizer=of.normalizer)
 
 
 def images_of(task: Task) -> dict[str, dict[str, Any]]:
     """Description of each image group, as plain values: the camera's settings, and the names of the channels."""
-    camera = getattr(task.config, "camera", None)
-    plan: KernelPlan | None = getattr(task, "plan", None)
-    found = {"policy": dataclasses.asdict(camera)} if camera is not None else {}
-    if plan is None:
-        return found
+    plan, found = task.plan, {}
     for group, name in plan.images.items():
-        sensor = plan.declaration.sensors[name]
-        found[group] = {"sensor": name, **dataclasses.asdict(sensor), "channels": sensor.rows(plan.views)}
+        sensor, given = plan.declaration.sensors[name], getattr(task.config, name, None)
+        # a camera of the configuration is described by its settings alone
+        settings = {} if isinstance(given, CameraConfig) else {"sensor": name}
+        described = dataclasses.asdict(given if isinstance(given, CameraConfig) else sensor)
+        found[group] = {**settings, **described, "channels": sensor.rows(plan.views)}
     return found

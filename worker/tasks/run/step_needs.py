@@ -1,4 +1,4 @@
-"""The needs of a declared task's step: the data, besides the joints, that it must update."""
+"""The needs of a task's step: the data, besides the joints, that it must update."""
 
 from __future__ import annotations
 

@@ -1,46 +1,61 @@
-"""A task: many worlds of one robot, with its actions, observations, reward terms and resets."""
+"""A task: many worlds of a robot, made of named terms for its actions, observations, rewards, ends and resets; the kernels follow."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
-from dataclasses import fields
-from typing import Any, ClassVar, Self
+from typing import Any
 
-import newton
 import torch
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
-from worker.settings.task import TaskConfig, default_rewards, value_at
+from shared_store.contract.error_text import nearest
+from worker.settings.task import TaskConfig, value_at
 from worker.simulation.capture import CapturedStep, on_torch_stream
-from worker.simulation.episodes import (
-    NO_MISHAP,
-    RESET,
-    STEP,
-    WATCHED,
-    EpisodeArrays,
-    check_observations,
-    mishap_causes,
-    randomize_ages,
-    read_mishap,
-)
-from worker.simulation.randomization import Randomizer
-from worker.simulation.terrain import Terrain
-from worker.simulation.world_cameras import WorldCameras
+from worker.simulation.episodes import NO_MISHAP, RESET, EpisodeArrays, mishap_causes, randomize_ages, read_mishap
+from worker.simulation.randomizations import Randomizations
+from worker.simulation.rendering import paint
+from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.robot_view import body_arrays
+from worker.simulation.sensors.camera import Camera
+from worker.simulation.sensors.sensor import SensorContext
 from worker.simulation.worlds import Worlds
+from worker.tasks.compile.configured import FACTOR_STREAMS
+from worker.tasks.compile.contract import contract
+from worker.tasks.compile.declaration_checks import placed
+from worker.tasks.compile.numbers import flat
 from worker.tasks.declare.interface import Interface
 from worker.tasks.run.adapting import Adapting
+from worker.tasks.run.buffers import Buffers
+from worker.tasks.run.control_step import ControlStep
 from worker.tasks.run.episode_records import LastEpisodes
 from worker.tasks.run.saved import check_state, completed
-from worker.tasks.run.task_checks import assert_replays, check_arguments, noise_of
-from worker.tasks.run.task_report import Telling
+from worker.tasks.run.sketch import TaskSketch
+from worker.tasks.run.task_checks import assert_replays, check_arguments
 
 
-class Task(Telling):
+class Task(TaskSketch):
     """A vector of Newton worlds that act, observe, are rewarded and reset themselves on the device.
 
-    A subclass names its configuration, terms and kernels and builds one world; this class does the rest. Every tensor
-    below is a fixed buffer on ``device``, shared with Warp; its address never changes.
+    A subclass gives its robot and its declaration; the kernels are compiled from the terms::
+
+        class Reach(Task, config={"episode_seconds": 5.0}):
+            def robot(self, config): return Robot("arm.xml")
+            def declare(self, config): return Declaration(actions=…, observations=…, rewards=…)
+
+    A control step is, in this order:
+
+    1. ``actions``: from the policy's output to the actuators.
+    2. Physics: ``config.substeps`` steps; after it sensors measure.
+    3. ``terminations``, then ``rewards`` and ``metrics``, of worlds whose physics did not fail.
+    4. The end of the step: clock, sums, statistics; selection of the worlds that begin a new episode.
+    5. For an episode that ended, the last observation, then ``curricula``.
+    6. In a world that goes on, ``commands`` whose time is up are drawn again, then ``events`` at intervals.
+    7. In a world that begins, memory and solver are cleared and every joint is at the model's position; ``events`` at a
+       reset place it, then ``commands`` are drawn.
+    8. ``observations`` of every world, with noise, clip, scale, delay and history.
+
+    Every tensor below is a fixed buffer on ``device``, shared with Warp; its address never changes.
 
     Args:
         config: The task's configuration, of type ``config_type``.
@@ -56,8 +71,8 @@ class Task(Telling):
         world_count: Number of worlds.
         max_episode_length: Control steps after which the clock ends an episode.
         actions: The next actions, shape ``(worlds, action_size)``, or ``(worlds, 1)`` of discrete choices; float32.
-        observations: The policy's input, shape ``(worlds, *observation_shape)``: float32, or uint8 with a camera.
-        states: The output of ``observe``, named by ``observation_names``, shape ``(worlds, states)``, float32; without a camera,
+        observations: The policy's input, shape ``(worlds, *observation_shape)``: float32, or uint8 of an image.
+        states: The columns named by ``observation_names``, shape ``(worlds, states)``, float32; unless the policy sees an image,
             the observations.
         terminal_observations: The states before the reset, valid where ``dones``; same shape as ``states``, float32.
         groups: The observation groups by name: ``policy`` is :attr:`observations`, ``critic`` the states without noise.
@@ -71,72 +86,39 @@ class Task(Telling):
         mishap: A world that failed and was reset since :meth:`clear_statistics`, and the cause: see :meth:`read_mishap`; shape
             ``(1,)``, int32.
         ended: The last finished episode of each world, see :class:`worker.tasks.run.episode_records.LastEpisodes`.
-        randomizer: How the worlds differ, see :class:`worker.simulation.randomization.Randomizer`.
         captured: Whether :meth:`step` replays a graph; true after construction, which captures one on trial.
+        views: Joints, bodies, sites and geoms of each robot and object, by its name.
+        readings: How the file of each robot was read, by its name.
+        declaration: The result of :meth:`declare`, with what the configuration adds.
+        plan: The declaration, bound to the robots.
+        robots: Columns of each robot or object in the rows of a world, by its name.
+        bodies: Poses and velocities of the bodies of all worlds.
+        sensors: The declared sensors, by name.
+        randomizations: The quantities that differ from world to world.
     """
 
-    config_type: ClassVar[type[TaskConfig]]
-    """Type of the configuration."""
-    parameters_type: ClassVar[Any]
-    """Warp struct for the kernels; its fields are filled from the configuration's fields of the same names.
-
-    A pair of numbers becomes a ``wp.vec2``."""
-    reward_terms: tuple[str, ...]
-    """Names of the reward terms, in the order of the configuration's ``rewards`` and of the kernel's indices; on the class, the default ones."""
-    observation_names: tuple[str, ...]
-    """Name of each observation, in order."""
-    further_names: tuple[str, ...] = ()
-    """Name of each column of the further observation groups, such as ``critic.speed``; of declared tasks."""
-    action_names: tuple[str, ...]
-    """Name of each action, in order (the joint that it drives); of a task with discrete actions, of each choice."""
-    discrete: bool = False
-    """Whether an action is one of several choices: its number, from 0, is then ``episodes.actions[world, 0]``."""
-    act: ClassVar[wp.Kernel]
-    """Kernel ``(parameters, worlds, episodes)`` over worlds: from ``episodes.actions`` to ``worlds.controls``."""
-    observe: ClassVar[wp.Kernel]
-    """Kernel ``(mode, max_age, parameters, worlds, episodes)`` over worlds; see :mod:`worker.simulation.episodes`."""
-    ground: ClassVar[bool] = False
-    """Whether the worlds stand on a ground plane."""
-    metric_names: tuple[str, ...] = ()
-    """Names of the metrics, which are logged besides the rewards as means over the steps; of declared tasks."""
-    termination_names: tuple[str, ...] = ()
-    """Names of the terminations, which are counted; of declared tasks."""
-    success: str | None = None
-    """The metric or termination that makes an evaluated episode a success; None: an episode that only the clock ended is one."""
-    memory_size: int = 0
-    """Numbers per world in ``episodes.memory``, such as commands; they are part of the state."""
-    lasting_size: int = 0
-    """Numbers that survive episodes, in ``episodes.lasting``."""
-    solver_options: Mapping[str, Any] = {}
-    """Options of ``newton.solvers.SolverMuJoCo``."""
-    template: newton.ModelBuilder  # of a sketch
+    device: str
+    world_count: int
+    worlds: Worlds
+    robots: dict[str, RobotArrays]
+    bodies: BodyArrays
+    sensors: dict[str, Any]
+    _episodes: EpisodeArrays
+    randomizations: Randomizations | None = None
     adapting: Adapting | None = None
-    _exact: tuple[wp.array[Any], wp.array[Any]] | None = None
-
-    def __init_subclass__(cls, **arguments: Any) -> None:
-        super().__init_subclass__(**arguments)
-        if hasattr(cls, "config_type"):
-            cls.reward_terms = tuple(default_rewards(cls.config_type))
 
     def __init__(
         self, config: TaskConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"
     ) -> None:
         check_arguments(type(self), config, world_count, seed, first_world)
         self.config = config
-        self.reward_terms = tuple(config.rewards)
         self.world_count = world_count
         self.device = "cuda:0" if device == "cuda" else device
-        self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
         self.first_world = first_world
         template = self._template()
-        self.action_size = len(self.action_names)
+        config = self.config
+        self.max_episode_length = max(1, round(config.episode_seconds * config.control_hz))
         self.observation_shape: tuple[int, ...] = (len(self.observation_names),)
-        self.statistic_names: tuple[str, ...] = (
-            *("episodes", "episode_return", "episode_length"),
-            *(*(f"reward_{name}" for name in self.reward_terms), *self.metric_names),
-            *("nan_worlds", "solver_overflows", "squared_return"),
-            *self.termination_names,
-        )
         try:
             self.worlds = Worlds(
                 template,
@@ -155,76 +137,157 @@ class Task(Telling):
         with on_torch_stream(self.device):
             self._allocate()
             self._prepare()
-        noise = self._noise()
+            self._control = ControlStep(self, self.bodies)
         wp.synchronize_device(self.device)
-
         self.seed(seed)
-        camera = getattr(config, "camera", None)
         with on_torch_stream(self.device):
-            self.randomizer = Randomizer(config.randomize, self.worlds, self._episodes, config.control_hz, noise)
-            self._camera = WorldCameras(camera, config.randomize, self.worlds, self._episodes) if camera else None
-            if self._camera:
-                self.observations = self._camera.images
-                self.observation_shape = tuple(self.observations.shape[1:])
             self.groups, self.terminal_groups = self._group()
             self._begin()
-            for _, part in self._parts():  # Load every kernel; not every platform can load one during a capture.
+            for (
+                _,
+                part,
+            ) in self._control.parts():  # Load every kernel; not every platform can load one during a capture.
                 part()
-        self._looks: dict[str, Callable[[], None] | None] = {}
-        self._steps = [CapturedStep(part, self.device).launch if whole else part for whole, part in self._parts()]
+        self._watchers: dict[str, Callable[[], None] | None] = {}
+        self._steps = [
+            CapturedStep(part, self.device).launch if whole else part for whole, part in self._control.parts()
+        ]
         self.captured = assert_replays(self, self._steps)
         self.restart(seed, first_world)
 
-    @classmethod
-    def sketch(cls, config: TaskConfig) -> Self:
-        """The task without worlds: names, one world (``template``), a declared task's :attr:`plan`. Raises ValueError for a wrong one."""
-        task = cls.__new__(cls)
-        task.config = config
-        task.reward_terms = tuple(config.rewards)
-        task.template = task._template()
-        return task
+    def interface(self) -> Interface:
+        """The policy's contract, derived from the declaration."""
+        return contract(self.plan, self.worlds)
 
-    def _template(self) -> newton.ModelBuilder:
-        template = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(template)
-        self.build(template)
-        return template
+    def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
+        """Further JSON documents of the bundle of a policy that ``algorithm``, a name, trained; by file name."""
+        return {}
 
-    def build(self, builder: newton.ModelBuilder) -> None:
-        """Add one world to an empty builder; MuJoCo's custom attributes are already registered."""
-        raise NotImplementedError
+    def _allocate(self) -> None:
+        """Allocate every buffer once, as views that torch and Warp share."""
+        self._causes = mishap_causes(self.reward_terms, (*self.observation_names, *self.further_names))
+        self._buffers = buffers = Buffers(self, len(self._causes))
+        self._episodes = buffers.arrays
+        self.actions = buffers["actions"]
+        self.states = self.observations = buffers["observations"]
+        self.terminal_observations = buffers["terminal_observations"]
+        self.rewards, self.dones, self.time_outs = buffers["rewards"], buffers["dones"], buffers["time_outs"]
+        self.episode_length = buffers["ages"]
+        self.mishap, self.statistics = buffers["mishap"], buffers["statistics"]
+        self.ended = LastEpisodes.of(self, buffers)
 
-    def stands_on(self) -> bool | Terrain:
-        """The terrain, or whether the worlds stand on a plane."""
-        return self.ground
+    def _prepare(self) -> None:
+        """Build the sensors."""
+        self.bodies = body_arrays(self.worlds)
+        self.robots = {name: view.arrays(self.worlds) for name, view in self.views.items()}
+        context = SensorContext(
+            self.worlds,
+            self.views,
+            self.robots,
+            self.bodies,
+            self._episodes,
+            self.ground_terrain,
+            self.config.control_hz,
+        )
+        self.sensors = {
+            name: self._build_sensor(name, each, context) for name, each in self.declaration.sensors.items()
+        }
+        samplings = {name: getattr(sensor, "sampling", None) for name, sensor in self.sensors.items()}  # of motions
+        self._samplings = {name: each for name, each in samplings.items() if each is not None and each.is_adaptive}
 
-    def read_model(self, parameters: Any) -> None:
-        """Fill the kernel parameters that depend on the built model (``self.worlds``); there are none by default."""
+    def _build_sensor(self, name: str, declared: Any, context: SensorContext) -> Any:
+        with placed(f"task {type(self).__name__}: sensors.{name}"):
+            return declared.build(dataclasses.replace(context, name=name))
 
-    def interface(self) -> Interface | None:
-        """The meaning of the policy's numbers on a robot, in the order of ``observation_names`` and ``action_names``; None: not declared.
+    def _begin(self) -> None:
+        """Once the random streams are seeded: draw each world's physics and patch of terrain, and run the startup events."""
+        cameras = [sensor for sensor in self.sensors.values() if isinstance(sensor, Camera)]
+        if self.randomizations is None:
+            if cameras:
+                paint(self.worlds, self._episodes, self.config.randomize.colors)
+            self.randomizations = Randomizations(
+                self.declaration.randomize,
+                self.worlds,
+                self._episodes,
+                self.views,
+                self.robots,
+                self.config.control_hz,
+                FACTOR_STREAMS,
+            )
+            for place, value in self.config.numbers.items():
+                if place.startswith("randomize."):
+                    view = self.numbers(place)
+                    view.copy_(torch.tensor(flat(f"config.numbers.{place}", value, view.numel())).view_as(view))
+            if rules := self.plan.adaptive:
+                self.adapting = Adapting(rules, self.numbers, self.world_count, self.device)
+        self.randomizations.restart()
+        if self.worlds.ground:
+            self.worlds.ground.deal(self._episodes)
+        for camera in cameras:
+            camera.begin(self.config.randomize)
+        self._control.startup()
 
-        It is exported with the policy. It also says which observations are measured; only these get noise.
+    def _group(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+        """The observation groups, and those before the reset; without a group of its own the critic sees the policy's."""
+        seen = {"policy": self.observations, "critic": self.states}
+        ended = {"policy": self.terminal_observations, "critic": self.terminal_observations}
+        for group, (rows, last) in self._control.rows.items():
+            seen[group], ended[group] = wp.to_torch(rows), wp.to_torch(last)
+        for group, name in self.plan.images.items():
+            seen[group] = self.sensors[name].images
+        if "policy" in self.plan.images:
+            self.observations = seen["policy"]
+            self.observation_shape = tuple(self.observations.shape[1:])
+            del ended["policy"]
+        return seen, ended
+
+    def numbers(self, place: str) -> torch.Tensor:
+        """A live view of the numbers of a place, such as ``events.push.speed``; writing to it changes the task from the next step on.
+
+        Raises:
+            ValueError: The place does not exist.
         """
-        return None
+        if place.startswith("randomize."):
+            known = self.randomizations.numbers() if self.randomizations else {}
+            if (entry := place.removeprefix("randomize.")) not in known:
+                raise ValueError(f"task {type(self).__name__}: it has no number {place}; {nearest(entry, known)}")
+            return known[entry]
+        first, count = self.plan.numbers.find(place, f"task {type(self).__name__}")
+        view: torch.Tensor = wp.to_torch(self._control.numbers)[first : first + count]
+        return view
 
     def begin_iteration(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
         """Called before every training iteration, outside the CUDA graph: the place for a curriculum.
 
-        By default it sets the numbers that ``config.curriculum`` names. A subclass may also fill device arrays that its kernels
-        read. The result must depend on the arguments alone, which are the same on every rank and after a restart.
+        By default it sets the adaptive numbers, then those that ``config.curriculum`` names. A subclass may also fill device arrays that
+        its kernels read. The result must depend on the arguments alone, which are the same on every rank and after a restart.
 
         Args:
             iteration: Number of finished iterations.
             reward: Mean return of the episodes that ended last; None before the first.
             episode_length: Their mean length [steps].
         """
+        if self.adapting:
+            self.adapting.begin(iteration, reward, episode_length)
         for name, points in self.config.curriculum.items():
             self._number(name).fill_(value_at(points, iteration))
 
     def _number(self, name: str) -> torch.Tensor:
         """The number that a curriculum changes under this name."""
-        return self.level if name == "level" else self._weights[self.reward_terms.index(name)]
+        if "." in name:
+            return self.numbers(name)
+        if name == "level":
+            return self._buffers["level"]
+        return self._buffers["weights"][self.reward_terms.index(name)]
+
+    def own_counts(self) -> Mapping[str, torch.Tensor]:
+        """The failures in each part of each motion."""
+        return {name: sampling.own_failures() for name, sampling in self._samplings.items()}
+
+    def take_counts(self, others: Mapping[str, torch.Tensor]) -> None:
+        """See :meth:`TaskReport.take_counts`."""
+        for name, failures in others.items():
+            self._samplings[name].take_failures(failures)
 
     def step(self, actions: torch.Tensor) -> None:
         """Act, simulate one control step, reward, and reset the worlds whose episode ended; nothing waits for the host.
@@ -236,23 +299,27 @@ class Task(Telling):
         for launch in self._steps:
             launch()
 
-    def watch(self, look: Callable[[], None] | None, by: str = "tap") -> None:
-        """Call ``look`` after every control step, instead of an earlier one ``by`` the same name; None: call nothing.
+    def move(self) -> None:
+        """Advance all worlds by one control step, by kernel launches alone: physics, or a subclass's own rule of motion."""
+        self.worlds.simulate()
+
+    def watch(self, watcher: Callable[[], None] | None, by: str = "tap") -> None:
+        """Call ``watcher`` after every control step, instead of an earlier one ``by`` the same name; None: call nothing.
 
         It launches kernels alone, which it has run once and which write nothing that the task reads. Graphs of :meth:`step` are captured anew.
         """
-        self._looks[by] = None if look is None else CapturedStep(look, self.device).launch
-        self._steps[len(self._parts()) :] = filter(None, self._looks.values())
+        self._watchers[by] = None if watcher is None else CapturedStep(watcher, self.device).launch
+        self._steps[len(self._control.parts()) :] = filter(None, self._watchers.values())
 
     def reset(self) -> None:
         """Begin a new episode with new random numbers in every world."""
         with on_torch_stream(self.device):
-            self._launch_observe(RESET)
+            self._control.judge_and_observe(int(RESET))
 
     def restart(self, seed: int, first_world: int) -> None:
         """Turn the worlds into those of another seed or global index, as if they had just been built.
 
-        The physics and the scene that ``config.randomize`` drew for each world stay as they are (``config.randomize.draws_worlds``).
+        The scene that ``config.randomize`` drew for each world stays as it is.
 
         Args:
             seed: Any integer >= 0.
@@ -261,16 +328,14 @@ class Task(Telling):
         self.first_world = first_world
         with on_torch_stream(self.device):
             self.worlds.restore_defaults()
-            self._lasting.zero_()
+            self._buffers["lasting"].zero_()
             self.seed(seed)
             self._begin()
         self.clear_statistics()
         self.reset()
 
     def seed(self, seed: int) -> None:
-        """Restart all random streams from another seed; the worlds change at their next reset.
-
-        The physics that ``randomize`` drew at construction stays.
+        """Restart all random streams from another seed; the worlds change at their next reset, their physics at a restart.
 
         Args:
             seed: Any integer >= 0.
@@ -281,9 +346,10 @@ class Task(Telling):
         if seed < 0:
             raise ValueError(f"seed is {seed}; use an integer >= 0")
         folded = (seed ^ (seed >> 32)) & 0xFFFFFFFF
-        self._random[:, 0] = folded - (1 << 32) if folded >= 1 << 31 else folded
-        self._random[:, 1] = torch.arange(self.first_world, self.first_world + self.world_count, dtype=torch.int32)
-        self._random[:, 2] = 0
+        random = self._buffers["random"]
+        random[:, 0] = folded - (1 << 32) if folded >= 1 << 31 else folded
+        random[:, 1] = torch.arange(self.first_world, self.first_world + self.world_count, dtype=torch.int32)
+        random[:, 2] = 0
 
     def set_random_episode_length(self) -> None:
         """Set the clock of every world to a random age, so that the worlds do not all time out in the same step."""
@@ -319,132 +385,42 @@ class Task(Telling):
             state: From :meth:`state_dict` of the same task with as many worlds.
 
         Raises:
-            ValueError: A tensor is missing, unknown, or of another shape or type, or the worlds' physics was drawn
-                differently; nothing has changed.
+            ValueError: A tensor is missing, unknown, or of another shape or type; nothing has changed.
         """
         tensors = self.state_tensors()
-        # older states lack tensors that begin an episode at 0
-        state = completed(tensors, state, len(self.metric_names))
+        drawn = self.randomizations.names if self.randomizations else ()
+        state = completed(tensors, state, len(self.metric_names), drawn)
         check_state(f"the saved state of task {type(self).__name__}", tensors, state)
         for name, tensor in tensors.items():
             tensor.copy_(state[name])
-
-    def _noise(self) -> list[float]:
-        """Standard deviation of the noise on each observation. Raises ValueError for an interface or a noise that does not fit."""
-        return noise_of(self)
-
-    def _allocate(self) -> None:
-        """Allocate every buffer once, as views that torch and Warp share."""
-        count, device = self.world_count, self.device
-
-        def buffer(name: str, shape: tuple[int, ...], dtype: Any) -> torch.Tensor:
-            array = wp.zeros(shape, dtype=dtype, device=device)
-            setattr(self._episodes, name, array)
-            shared: torch.Tensor = wp.to_torch(array)
-            return shared
-
-        self._episodes = EpisodeArrays()
-        self._episodes.warm_start = self.worlds.arrays.warm_start
-        self._episodes.activations = self.worlds.arrays.activations
-        self.actions = buffer("actions", (count, 1 if self.discrete else self.action_size), wp.float32)
-        states = len(self.observation_names)
-        self.states = self.observations = buffer("observations", (count, states), wp.float32)
-        self.terminal_observations = buffer("terminal_observations", (count, states), wp.float32)
-        self.rewards = buffer("rewards", (count,), wp.float32)
-        self.dones = buffer("dones", (count,), wp.bool)
-        self.time_outs = buffer("time_outs", (count,), wp.bool)
-        self.episode_length = buffer("ages", (count,), wp.int32)
-        self._sums = buffer("sums", (count, 2 + len(self.reward_terms) + len(self.metric_names)), wp.float32)
-        self._random = buffer("random", (count, 3), wp.int32)
-        buffer("terms", (min(WATCHED, count), len(self.reward_terms)), wp.float32)
-        self._memory = buffer("memory", (count, self.memory_size), wp.float32)
-        self._lasting = buffer("lasting", (count, self.lasting_size), wp.float32)
-        self._last_actions = buffer("last_actions", tuple(self.actions.shape), wp.float32)
-        self._earlier_actions = buffer("earlier_actions", tuple(self.actions.shape), wp.float32)
-        self._broken = buffer("broken", (count,), wp.int32)
-        self.mishap = buffer("mishap", (1,), wp.int32)
-        self._causes = mishap_causes(self.reward_terms, (*self.observation_names, *self.further_names))
-        self._episodes.causes_of_mishaps = len(self._causes)
-        self._weights = buffer("weights", (len(self.reward_terms),), wp.float32)
-        self._weights.copy_(torch.tensor(list(self.config.rewards.values())))
-        self.level = buffer("level", (1,), wp.float32)
-        self.level.fill_(1.0)
-        self.statistics = buffer("statistics", (len(self.statistic_names),), wp.float64)
-        self.ended = LastEpisodes.of(self, buffer)
-
-    def _group(self) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-        """The observation groups, and those before the reset. The critic's have buffers of their own only where there is noise."""
-        if self.randomizer.has_noise:
-            self._exact = (
-                wp.zeros_like(self._episodes.observations),
-                wp.zeros_like(self._episodes.terminal_observations),
-            )
-            known, ended = map(wp.to_torch, self._exact)
-        else:
-            known, ended = self.states, self.terminal_observations
-        seen = {"policy": self.observations, "critic": known}
-        before = {"critic": ended} if self._camera else {"policy": self.terminal_observations, "critic": ended}
-        return seen, before
+        if self.adapting:
+            self.adapting.read()
+        with on_torch_stream(self.device):
+            if self.randomizations:
+                self.randomizations.apply()
+            if self._control.needs.placed:
+                self.worlds.update_bodies()
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Views of all state that persists between control steps."""
-        arrays = self.worlds.arrays
-        own = {"memory": self._memory, "activations": wp.to_torch(arrays.activations)}
-        return {
-            **{name: tensor for name, tensor in own.items() if tensor.numel()},
-            **({"images": self._camera.images} if self._camera else {}),
-            **self.randomizer.state_tensors(),
+        """Live views of all state that persists between control steps."""
+        arrays, buffers = self.worlds.arrays, self._buffers
+        optional = {"memory": buffers["memory"], "activations": wp.to_torch(arrays.activations)}
+        optional["lasting"] = buffers["lasting"]
+        tensors = {
+            **{name: tensor for name, tensor in optional.items() if tensor.numel()},
             "joint_q": wp.to_torch(arrays.joint_q),
             "joint_qd": wp.to_torch(arrays.joint_qd),
             "solver_warm_start": wp.to_torch(arrays.warm_start),
             "observations": self.states,
-            **({"exact_observations": wp.to_torch(self._exact[0])} if self._exact else {}),
             "episode_length": self.episode_length,
-            "episode_sums": self._sums,
-            "random": self._random,
-            "broken": self._broken,
+            "episode_sums": buffers["sums"],
+            **{name: buffers[name] for name in ("random", "broken", "last_actions", "earlier_actions")},
+            **self._control.state_tensors(),
         }
-
-    def _prepare(self) -> None:
-        """Prepare the kernels' inputs other than the worlds and episodes."""
-        self._parameters = self.parameters_type()
-        for item in fields(self.config):
-            if hasattr(self._parameters, item.name):
-                value = getattr(self.config, item.name)
-                setattr(self._parameters, item.name, wp.vec2(*value) if isinstance(value, tuple) else value)
-        self.read_model(self._parameters)
-
-    def _begin(self) -> None:
-        """Initialise each world once: called after the random streams are seeded, and again after the trial step."""
-
-    def _parts(self) -> list[tuple[bool, Callable[[], None]]]:
-        """The parts of the control step, in order, and whether a graph holds each."""
-        return [(True, self._launch_step)]
-
-    def _launch_step(self) -> None:
-        """Launch the whole control step."""
-        self.randomizer.push()
-        wp.launch(
-            self.act,
-            dim=self.world_count,
-            inputs=[self._parameters, self.worlds.arrays, self._episodes],
-            device=self.device,
-        )
-        self.randomizer.delay()
-        self.worlds.simulate()
-        self._launch_observe(STEP)
-
-    def _launch_observe(self, mode: int) -> None:
-        wp.launch(
-            self.observe,
-            dim=self.world_count,
-            inputs=[int(mode), self.max_episode_length, self._parameters, self.worlds.arrays, self._episodes],
-            device=self.device,
-        )
-        wp.launch(check_observations, dim=self.world_count, inputs=[self._episodes], device=self.device)
-        if self._exact:
-            wp.copy(self._exact[0], self._episodes.observations)
-            wp.copy(self._exact[1], self._episodes.terminal_observations)
-        self.randomizer.add_noise(int(mode))
-        if self._camera:
-            self._camera.render(int(mode))
+        if self.adapting:
+            tensors["adaptive_numbers"] = self.adapting.state
+        for name, sensor in self.sensors.items():
+            tensors |= {f"sensor_{name}_{key}": tensor for key, tensor in sensor.state_tensors().items()}
+        for part in (self.worlds.ground, self.worlds.drives, self.randomizations):
+            tensors |= part.state_tensors() if part else {}
+        return tensors

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from worker.tasks.run.step_log import StepLog
 
 
-class Telling:
+class TaskReport:
     """A task that shows no metric, has no function of the user, logs no control steps and shares no counts; others override this."""
 
     final_metrics: tuple[str, ...] = ()

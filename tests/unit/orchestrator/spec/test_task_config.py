@@ -19,7 +19,7 @@ from orchestrator.spec.model import validate
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import known_tasks
 from tests.support.refusals import refusal
-from worker.learning.job import configure
+from worker.learning.job import configure, user_errors
 from worker.settings.errors import UserError
 from worker.settings.overrides import configured
 from worker.tasks import find_task
@@ -30,8 +30,8 @@ WRONG = {
     # misspelt
     "Ant fall_hight: 0.3": "fall_hight: AntConfig has no such key; did you mean fall_height?",
     "Ant randomize: {mas: [1, 2]}": "randomize.mas: Randomization has no such key; did you mean mass?",
-    "Ant rewards: {foward: 1.0}": "rewards.foward: AntConfig has no term 'foward'; did you mean forward?",
-    "Cartpole rewards: {xyz: 1.0}": "rewards.xyz: CartpoleConfig has no term 'xyz'; there are alive, angle, position",
+    "Ant rewards: {foward: 1.0}": "rewards.foward: the task has no term 'foward'; did you mean forward?",
+    "Cartpole rewards: {xyz: 1.0}": "rewards.xyz: the task has no term 'xyz'; there are alive, angle, position",
     "CartpolePixels camera: {witdh: 32}": "camera.witdh: CameraConfig has no such key; did you mean width?",
     # another type
     "Ant fall_height: low": "fall_height: expected a number, found a text ('low')",
@@ -91,15 +91,22 @@ def test_the_submission_and_the_rank_refuse_the_same_in_the_same_words(tmp_path:
     path.write_text(f"name: a\ntrain:\n  task: {task}\n  worlds: 4\n  iterations: 2\n  config:\n    {config}\n")
     submitted = refusal(load, str(path), error=SpecError)
     assert submitted.startswith(f"{path}:7: train.config.{WRONG[case]}")
-    started = refusal(configure, find_task(task), yaml.safe_load(path.read_text())["train"], error=UserError)
-    assert submitted == f"{path}:7: {started}"
+    train = yaml.safe_load(path.read_text())["train"]
+
+    def start() -> None:
+        with user_errors():
+            find_task(task).sketch(configure(find_task(task), train))
+
+    # only the whole task knows its terms, and names the place in its configuration
+    started = refusal(start, error=UserError).removeprefix("train.")
+    assert submitted == f"{path}:7: train.{started}"
 
 
 def test_the_line_is_that_of_the_value_and_a_change_has_none(tmp_path: Path) -> None:
     path = tmp_path / "job.yaml"
     config = "  config:\n    rewards:\n      up: 1\n      fall: -1\n      foward: 2\n"
     path.write_text(f"name: a\ntrain:\n  task: Ant\n  worlds: 4\n  iterations: 2\n{config}")
-    with pytest.raises(SpecError, match=r"job\.yaml:10: train\.config\.rewards\.foward: AntConfig has no term"):
+    with pytest.raises(SpecError, match=r"job\.yaml:10: train\.config\.rewards\.foward: the task has no term"):
         load(str(path))
     path.write_text("name: a\ntrain: {task: Ant, worlds: 4, iterations: 2}\n")
     said = refusal(load, str(path), ["train.config.fall_height=low"], error=SpecError)
@@ -194,7 +201,7 @@ def test_a_task_of_an_installed_package_is_checked_by_the_class_that_it_names() 
     submit("Reach", {"reach": 1, "rewards": {"near": 2}})
     for config, said in (
         ({"reach": "far"}, "reach: expected a number, found a text ('far')"),
-        ({"rewards": {"nera": 1}}, "rewards.nera: ReachConfig has no term 'nera'; did you mean near?"),
+        ({"rewards": {"nera": 1}}, "rewards.nera: the task has no term 'nera'; did you mean near?"),
         ({"substeps": 0}, "substeps: expected a value greater than or equal to 1, found 0"),
     ):
         assert refusal(submit, "Reach", config, error=SpecError) == f"job.yaml: train.config.{said}"

@@ -1,21 +1,16 @@
-"""The cameras of the worlds, one in each: they render straight into the buffer that the policy reads."""
+"""Parts of cameras: Newton's renderer, poses and colours that differ from world to world, stacks of images."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import newton
-import torch
 import warp as wp
 from newton.sensors import SensorCamera
 
-from worker.settings.camera import CameraConfig
-from worker.simulation.episodes import STEP, EpisodeArrays, numbered_stream
+from worker.simulation.episodes import EpisodeArrays, numbered_stream
 from worker.simulation.worlds import Worlds
-
-if TYPE_CHECKING:
-    from worker.settings.task import Randomization
 
 wp.set_module_options({"enable_backward": False})
 
@@ -106,22 +101,6 @@ def to_byte(value: float) -> wp.uint8:
     return wp.uint8(wp.clamp(wp.round(value), 0.0, 255.0))
 
 
-@wp.kernel
-def _stack(
-    mode: int,
-    rendered: wp.array3d[wp.uint32],
-    light: wp.array[wp.float32],
-    episodes: EpisodeArrays,
-    images: wp.array4d[wp.uint8],
-):
-    """Unpack one pixel and push it before the earlier ones; an episode's first image stands for those before it."""
-    world, row, column = wp.tid()
-    pixel = rendered[world, row, column]
-    first = mode != STEP or episodes.dones[world]
-    for channel in range(3):
-        push(images, world, channel, 3, row, column, to_byte(shaded(pixel, channel, light[world])), first)
-
-
 def renderer(model: newton.Model, samples: int) -> SensorCamera:
     """Newton's camera of a model, with a light from above and without shadows and textures.
 
@@ -166,56 +145,3 @@ def paint(worlds: Worlds, episodes: EpisodeArrays, amount: float) -> None:
 def draw_light(ends: Sequence[float], episodes: EpisodeArrays, light: wp.array[wp.float32]) -> None:
     """Draw how bright each world is, the same for all its cameras, shape ``(worlds,)``."""
     wp.launch(_draw_light, dim=light.shape, inputs=[wp.vec2(*ends), episodes, light], device=light.device)
-
-
-class WorldCameras:
-    """Renders all worlds into :attr:`images`; launches only, so that it can be captured.
-
-    Args:
-        config: Pose, resolution and field of view.
-        randomize: How the scenes of the worlds differ. The constructor changes the colours in the worlds' model.
-        worlds: The worlds to render.
-        episodes: The task's buffers; ``random`` holds seed and global indices already.
-
-    Attributes:
-        images: What the policy sees, shape ``(worlds, 3 * frames, height, width)``, uint8: red, green and blue in sRGB, the
-            present frame first.
-    """
-
-    def __init__(self, config: CameraConfig, randomize: Randomization, worlds: Worlds, episodes: EpisodeArrays) -> None:
-        self._worlds, self._episodes = worlds, episodes
-        model, count = worlds.model, worlds.world_count
-        self._device = model.device
-        self._sensor = renderer(model, config.samples)
-        self._rays = SensorCamera.compute_camera_rays_pinhole(
-            config.width, config.height, camera_fov=config.fov, sample_count=config.samples, device=self._device
-        )
-        self._rendered = self._sensor.allocate_image_color(count, config.width, config.height)
-        shape = (count, config.channels, config.height, config.width)
-        self._images = wp.zeros(shape, dtype=wp.uint8, device=self._device)
-        self.images: torch.Tensor = wp.to_torch(self._images)
-        self._poses = wp.zeros(count, dtype=wp.transformf, device=self._device)
-        usual = wp.full(count, look(config.position, config.target), dtype=wp.transformf, device=self._device)
-        self._light = wp.ones(count, dtype=wp.float32, device=self._device)
-        wp.launch(
-            displace,
-            dim=count,
-            inputs=[_STREAM, wp.vec3(randomize.camera_position), wp.vec3(randomize.camera_angle), episodes, usual],
-            outputs=[self._poses],
-            device=self._device,
-        )
-        paint(worlds, episodes, randomize.colors)
-        draw_light(randomize.light, episodes, self._light)
-
-    def render(self, mode: int) -> None:
-        """After ``observe`` in ``mode``: render every world, including those that were just reset."""
-        self._worlds.update_bodies()
-        self._worlds.update_shapes()
-        self._sensor.update(self._worlds.state, self._poses, self._rays, color_image=self._rendered)
-        wp.launch(
-            _stack,
-            dim=self._rendered.shape,
-            inputs=[mode, self._rendered, self._light, self._episodes],
-            outputs=[self._images],
-            device=self._device,
-        )
