@@ -1,4 +1,4 @@
-"""``muster resume`` and ``muster clone``: jobs that begin with what a run has learnt."""
+"""Continuing runs: ``muster resume`` and ``muster clone``."""
 
 from __future__ import annotations
 

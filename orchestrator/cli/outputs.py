@@ -1,4 +1,4 @@
-"""The files that commands write."""
+"""Outputs: the files that commands write."""
 
 from __future__ import annotations
 

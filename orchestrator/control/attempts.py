@@ -28,7 +28,7 @@ from orchestrator.control.stops import Stops
 from orchestrator.control.usage import add_usage, charge, placements_of, resource_seconds
 from orchestrator.domain import attempt_instructions as do
 from orchestrator.domain.attempt import FINISHING, AttemptPhase, AttemptState, after, step
-from orchestrator.domain.attempt_events import Delayed, Due, Event, Gone, Launched, Preempted, Prepared, Refused
+from orchestrator.domain.attempt_events import Delayed, Due, Event, Gone, Launched, Preempted, Prepared, StartRefused
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status
 from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
@@ -233,7 +233,7 @@ class Attempts:
 
     def _prepare(
         self, session: Session, job: Job, attempt: Attempt, opened: _Open
-    ) -> Prepared | Delayed | Refused | None:
+    ) -> Prepared | Delayed | StartRefused | None:
         """Read the run, record its owner, then take it."""
         key = opened.key
         try:
@@ -248,7 +248,7 @@ class Attempts:
         except StoreUnavailable as error:
             return Delayed(str(error), idle=True)
         except (RunRefused, ValueError) as error:
-            return Refused(str(error))
+            return StartRefused(str(error))
         return Prepared(epoch) if epoch is not None else self._errands.delayed(key)
 
     def _take(self, session: Session, job: Job, attempt: Attempt, run: ObservedRun) -> Callable[[], int]:
@@ -277,7 +277,7 @@ class Attempts:
         except NotYet as wait:
             return Delayed(str(wait), idle=not wait.unknown)
         except EngineError as error:
-            return Refused(str(error), is_final=not isinstance(error, CannotStart))
+            return StartRefused(str(error), is_final=not isinstance(error, CannotStart))
 
     def gang(self, job: Job, attempt: Attempt, spec: GangSpec, options: Mapping[str, str]) -> Gang:
         """The gang that the engine starts for an attempt; ``options``: those of its compute environment and queue."""

@@ -20,8 +20,8 @@ from orchestrator.domain.attempt_events import (
     Observed,
     Preempted,
     Prepared,
-    Refused,
     Silence,
+    StartRefused,
 )
 from orchestrator.domain.excerpts import LONGEST_REASON, excerpt
 from orchestrator.domain.job import (
@@ -158,17 +158,17 @@ def step(state: AttemptState, event: Event) -> do.Instructions:
             return do.TakeEpoch(epoch), do.Save(), do.Launch()
         case AttemptPhase.PREPARING, Delayed(reason, idle=True):
             return (do.Withdraw(reason),)
-        case AttemptPhase.PREPARING, Refused(reason):
+        case AttemptPhase.PREPARING, StartRefused(reason):
             return do.Decide(Verdict(Ending.FATAL, reason, start_error=reason)), do.WindUp()
         case AttemptPhase.LAUNCHING, Due():
             return (do.Launch(again=state.verdict is None and state.stop_reason is None),)
         case AttemptPhase.LAUNCHING, Launched(handle):
             return do.Keep(handle), do.Save(), do.Observe()
-        case AttemptPhase.LAUNCHING, Delayed(idle=True) | Refused() if state.verdict is not None:
+        case AttemptPhase.LAUNCHING, Delayed(idle=True) | StartRefused() if state.verdict is not None:
             return (do.WindUp(),)
         case AttemptPhase.LAUNCHING, Delayed(idle=True) if state.stop_reason is not None:
             return do.Decide(Verdict(Ending.STOPPED, state.stop_reason)), do.WindUp()
-        case AttemptPhase.LAUNCHING, Refused():
+        case AttemptPhase.LAUNCHING, StartRefused():
             return do.Decide(_refused(state.terms, event)), do.WindUp()
         case _, Preempted(reason) if state.verdict is None:
             return (do.Decide(Verdict(Ending.PREEMPTED, reason)),)
@@ -183,7 +183,7 @@ def step(state: AttemptState, event: Event) -> do.Instructions:
     return ()
 
 
-def _refused(terms: Terms, event: Refused) -> Verdict:
+def _refused(terms: Terms, event: StartRefused) -> Verdict:
     ending = Ending.FATAL if event.is_final else Ending.FAILED
     reason = f"{NOT_STARTED}{event.reason}" if event.is_final else event.reason
     return Verdict(ending, reason if terms.options.is_native else AWS_NOT_STARTED, start_error=event.reason)

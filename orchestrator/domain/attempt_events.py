@@ -39,7 +39,7 @@ class Launched:
 
 
 @dataclass(frozen=True)
-class Refused:
+class StartRefused:
     """The run can't be used, or the engine does not start the gang."""
 
     reason: str
@@ -100,4 +100,4 @@ class Gone:
     """How often the job is started again after that."""
 
 
-Event = Due | Prepared | Launched | Refused | Delayed | Preempted | Observed | Gone
+Event = Due | Prepared | Launched | StartRefused | Delayed | Preempted | Observed | Gone

@@ -10,7 +10,7 @@ from orchestrator.domain.job import Status, Verdict
 
 @dataclass(frozen=True)
 class Prepare:
-    """Create the run where it is missing, and give it to the attempt: → Prepared, Delayed or Refused, or nothing yet."""
+    """Create the run where it is missing, and give it to the attempt: → Prepared, Delayed or StartRefused, or nothing yet."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Withdraw:
 
 @dataclass(frozen=True)
 class Launch:
-    """Ask the engine to launch the gang, which it does once for an epoch: → Launched, Delayed or Refused."""
+    """Ask the engine to launch the gang, which it does once for an epoch: → Launched, Delayed or StartRefused."""
 
     again: bool = True
     """Whether to try again where nothing of the gang can run yet."""

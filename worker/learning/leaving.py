@@ -1,4 +1,4 @@
-"""The end of a training: after its last checkpoint, however long the store takes, or in the middle of an iteration.
+"""Leaving a training: after its last checkpoint, however long the store takes, or in the middle of an iteration.
 
 A stopped job has a few seconds, and an iteration may take minutes. A request to exit is seen once in an iteration, in its middle: at worst,
 the rank exits almost two iterations later. Where that could be too late, every iteration is saved (the signal ``long`` of

@@ -18,9 +18,9 @@ from worker.learning.distributed import Gang
 from worker.learning.exchange import SIGNALS, Exchange
 from worker.learning.hooks import FaultInjection, Hook
 from worker.learning.incident import Incident
-from worker.learning.initial_weights import adopt, load_teacher
 from worker.learning.job import StopRequest, end_startup, user_errors
 from worker.learning.leaving import complete, patience_of
+from worker.learning.loaded_weights import adopt, load_teacher
 from worker.learning.randomness import seed_generators
 from worker.learning.report import Failures, Reporting, Stopwatch, figures_of, shown_of, straggler
 from worker.learning.reporter import Beacon, Fence, Gate, Reporter

@@ -8,8 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from racer.rewards.translation.calls import BUILTINS, Calls
-from racer.rewards.translation.prelude import CONSTANTS, NO_RESULT
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     C_TYPES,
     Function,
     Known,
@@ -23,6 +22,7 @@ from racer.rewards.translation.values import (
     rebuilt,
     shape_of,
 )
+from racer.rewards.translation.prelude import CONSTANTS, NO_RESULT
 
 _MOST_PASSES = 16
 _MOST_NAMES = 50_000

@@ -11,9 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from racer.rewards.parameters import BY_NAME
-from racer.rewards.translation.expressions import Expressions, fits
-from racer.rewards.translation.prelude import EMPTY, FUNCTIONS
-from racer.rewards.translation.values import (
+from racer.rewards.translation.expression_values import (
     KINDS,
     LONGEST_GROUP,
     PARAMS,
@@ -28,6 +26,8 @@ from racer.rewards.translation.values import (
     joined,
     kept,
 )
+from racer.rewards.translation.expressions import Expressions, fits
+from racer.rewards.translation.prelude import EMPTY, FUNCTIONS
 from shared_store.contract.error_text import counted
 
 BUILTINS = {

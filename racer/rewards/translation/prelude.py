@@ -1,4 +1,4 @@
-"""Python's arithmetic, its functions of numbers, its indices and errors in C++.
+"""The prelude of the C++: Python's arithmetic, its functions of numbers, its indices and errors in C++.
 
 ``at`` is 16 times the line; an error's number is added to it.
 """

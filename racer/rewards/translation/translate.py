@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from racer.rewards.problems import LARGEST_REWARD, out_of_range
 from racer.rewards.translation.body import Module
+from racer.rewards.translation.expression_values import PARAMS, Function, Outside, described, kind_of
 from racer.rewards.translation.prelude import BEYOND, ERRORS, NOT_FINITE, prelude
-from racer.rewards.translation.values import PARAMS, Function, Outside, described, kind_of
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import torch.distributed as dist
 from shared_store.volume.layout import Store
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from worker.learning.distributed import Gang, RankPlacement
-from worker.learning.initial_weights import load_teacher
 from worker.learning.job import Job
+from worker.learning.loaded_weights import load_teacher
 from worker.learning.trained import choose_checkpoint
 from worker.settings.errors import UserError
 

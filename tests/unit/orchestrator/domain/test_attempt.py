@@ -19,8 +19,8 @@ from orchestrator.domain.attempt_events import (
     Observed,
     Preempted,
     Prepared,
-    Refused,
     Silence,
+    StartRefused,
 )
 from orchestrator.domain.excerpts import LONGEST_REASON
 from orchestrator.domain.job import AWS_EXITED, Ending, NodeEnd, Status, Verdict
@@ -116,7 +116,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     ),
     "a run that can't be used is final": (
         PREPARING,
-        Refused("it is damaged"),
+        StartRefused("it is damaged"),
         [do.Decide(Verdict(Ending.FATAL, "it is damaged", start_error="it is damaged")), do.WindUp()],
     ),
     "while its run can't be read, others may have its room": (
@@ -152,23 +152,23 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     "unless something may run": (asked(LAUNCHING), Delayed("silent"), [do.Explain("silent")]),
     "a refusal of what is to end anyway changes nothing": (
         ending(Ending.PREEMPTED, of=LAUNCHING),
-        Refused("gone", is_final=False),
+        StartRefused("gone", is_final=False),
         [do.WindUp()],
     ),
-    "a refusal is final": (LAUNCHING, Refused("no such image"), [do.Decide(REFUSED), do.WindUp()]),
+    "a refusal is final": (LAUNCHING, StartRefused("no such image"), [do.Decide(REFUSED), do.WindUp()]),
     "a start that failed is an attempt that failed": (
         LAUNCHING,
-        Refused(DRIVER, is_final=False),
+        StartRefused(DRIVER, is_final=False),
         [do.Decide(Verdict(Ending.FAILED, DRIVER, start_error=DRIVER)), do.WindUp()],
     ),
     "on AWS it has AWS's reason": (
         on_aws(LAUNCHING),
-        Refused(DRIVER, is_final=False),
+        StartRefused(DRIVER, is_final=False),
         [do.Decide(Verdict(Ending.FAILED, "Task failed to start", start_error=DRIVER)), do.WindUp()],
     ),
     "so has a refusal on AWS": (
         on_aws(LAUNCHING),
-        Refused("no such image"),
+        StartRefused("no such image"),
         [do.Decide(Verdict(Ending.FATAL, "Task failed to start", start_error="no such image")), do.WindUp()],
     ),
     "before its launch nothing can be seen of it": (LAUNCHING, seen(), []),

@@ -19,8 +19,8 @@ from orchestrator.domain.attempt_events import (
     Observed,
     Preempted,
     Prepared,
-    Refused,
     Silence,
+    StartRefused,
 )
 from orchestrator.domain.job import Ending, NodeEnd, Status
 from orchestrator.domain.native_options import NativeOptions
@@ -40,9 +40,9 @@ delays = st.builds(Delayed, words, st.booleans())
 prepared = st.just(Prepared(7))
 prepares = st.one_of(
     *[prepared] * 3,
-    *(st.none(), st.just(Delayed("silent")), st.just(Refused("refused"))),
+    *(st.none(), st.just(Delayed("silent")), st.just(StartRefused("refused"))),
 )
-launches = st.one_of(*[st.just(Launched("handle"))] * 4, delays, st.just(Refused("refused")))
+launches = st.one_of(*[st.just(Launched("handle"))] * 4, delays, st.just(StartRefused("refused")))
 looks = st.builds(Observed, moments, both, silences, words, words, words)
 gone = st.builds(Gone, moments, both | st.just([]), words)
 stops = st.one_of(gone, gone, gone, st.none(), st.just(Delayed("not allowed")))
