@@ -13,12 +13,20 @@ MIGRATIONS = Path(__file__).parent / "migrations"
 NEWEST = max(path.name for path in (MIGRATIONS / "versions").glob("[0-9]*.py")).partition("_")[0]
 """Revision of the tables of :mod:`orchestrator.persistence.batch_models`."""
 _VERSION = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
-_OLDEST = "0001"
-"""The revision of databases from before migrations existed."""
 
 
-class NewerSchema(Exception):
-    """The database has a revision that this Muster does not know; the message is its name."""
+class UnknownSchema(Exception):
+    """The database has a revision without a migration here: a newer one, or one from before the base.
+
+    Attributes:
+        revision: The revision; None: the database is from before revisions existed.
+        is_older: Whether it is from before the base.
+    """
+
+    def __init__(self, revision: str | None) -> None:
+        super().__init__(revision)
+        self.revision = revision
+        self.is_older = revision is None or revision < NEWEST
 
 
 def schema_of(connection: Connection) -> str | None:
@@ -27,7 +35,7 @@ def schema_of(connection: Connection) -> str | None:
 
 
 def bring_up_to_date(connection: Connection) -> None:
-    """Create the tables, or migrate existing ones. Raises NewerSchema.
+    """Create the tables, or migrate existing ones. Raises UnknownSchema.
 
     Alembic is imported only where there is something to migrate: it takes as long as half of the rest of a start.
     """
@@ -50,10 +58,6 @@ def bring_up_to_date(connection: Connection) -> None:
     config = Config()
     config.set_main_option("script_location", str(MIGRATIONS))
     config.attributes["connection"] = connection
-    if present is not None and present not in {
-        each.revision for each in ScriptDirectory.from_config(config).walk_revisions()
-    }:
-        raise NewerSchema(present)
-    if present is None:
-        command.stamp(config, _OLDEST)
+    if present not in {each.revision for each in ScriptDirectory.from_config(config).walk_revisions()}:
+        raise UnknownSchema(present)
     command.upgrade(config, "head")

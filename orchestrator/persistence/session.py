@@ -30,7 +30,7 @@ from sqlalchemy.orm import ORMExecuteState, Session
 from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.job_counts import JobCounts, note_counts
-from orchestrator.persistence.schema import NEWEST, NewerSchema, bring_up_to_date, schema_of
+from orchestrator.persistence.schema import NEWEST, UnknownSchema, bring_up_to_date, schema_of
 from orchestrator.persistence.updates import write_changes
 from orchestrator.persistence.urls import connect_args, database_url, is_in_memory, shown
 
@@ -296,10 +296,15 @@ class Database:
         with self._unchecked() as connection:
             try:
                 bring_up_to_date(connection)
-            except NewerSchema as newer:
+            except UnknownSchema as error:
+                where = f"database {shown(str(self.engine.url))}"
+                if error.is_older:
+                    raise DatabaseError(
+                        f"{where} has schema {error.revision or 'without a revision'}, and this Muster reads {NEWEST} or newer; lift it, "
+                        "in a clone of Muster, with: python -m docs.tools.lift_database URL-OR-FILE"
+                    ) from None
                 raise DatabaseError(
-                    f"database {shown(str(self.engine.url))} was written by a newer Muster (schema {newer}); "
-                    "install that version, or use another database"
+                    f"{where} was written by a newer Muster (schema {error.revision}); install that version, or use another database"
                 ) from None
 
     @contextmanager

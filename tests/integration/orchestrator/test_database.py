@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -38,9 +40,9 @@ from orchestrator.persistence.queries import find_job
 from orchestrator.persistence.schema import NEWEST
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from tests.conftest import Serving, wait_for
+from tests.conftest import REPOSITORY, Serving, wait_for
 from tests.support.orchestrator import postgres
-from tests.support.orchestrator.databases import connected, migrate
+from tests.support.orchestrator.databases import connected, lift_whole, make_older
 from tests.support.orchestrator.rows import job
 
 
@@ -78,7 +80,7 @@ OLD = {"name": "old", "queue": "default", "definition": "arn", "request": "{}", 
 @pytest.mark.parametrize("history", ["new", "migrated"])
 def test_a_new_and_a_migrated_database_match_the_tables(url: str, opened: Callable[[], Database], history: str) -> None:
     if history == "migrated":
-        migrate(url, "upgrade", "head")
+        make_older(url, "0021")
     database = opened()
     with database.engine.connect() as connection:
         context = MigrationContext.configure(connection)
@@ -89,12 +91,13 @@ def test_a_new_and_a_migrated_database_match_the_tables(url: str, opened: Callab
 
 
 def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, opened: Callable[[], Database]) -> None:
-    migrate(url, "upgrade", "0001")
+    make_older(url, "0001")
     facts = {**OLD, "run": "r", "status": "FAILED", "created_at": 5, "attempts_allowed": 3}
     insert(url, "jobs", [{"id": "j1", **facts}])
     insert(url, "attempts", [{"job_id": "j1", "number": 1, "epoch": 1, "nodes": "[]", "created_at": 5, "spent": True}])
     with connected(url) as connection:
         connection.execute(text("DROP TABLE alembic_version"))  # the first version had no migrations
+    lift_whole(url)
     with opened().session() as session:
         old = session.get_one(Job, "j1")
         assert [attempt.number for attempt in old.attempts] == [1]
@@ -128,7 +131,7 @@ def test_keys_and_secrets_are_in_either_database_for_a_process_beside_its_contro
 
 
 def test_an_older_database_begins_with_retention_at_its_upgrade(url: str, opened: Callable[[], Database]) -> None:
-    migrate(url, "upgrade", "0017")
+    make_older(url, "0017")
     spec = {"train": {"rsl_rl": {"teacher_checkpoint": "teacher@3"}}, "evaluate": {"run": "read"}}
     pairs = [{"name": "MUSTER_SPEC", "value": json.dumps(spec)}, {"name": "MUSTER_PARENT", "value": "parent@9"}]
     properties = json.dumps({"nodeRangeProperties": [{"container": {"environment": pairs}}]})
@@ -149,6 +152,7 @@ def test_an_older_database_begins_with_retention_at_its_upgrade(url: str, opened
         insert(url, "jobs", [{**facts, "id": name, "status": status, "node_properties": own}])
     insert(url, "jobs", [{**facts, "id": "damaged", "status": "RUNNABLE", "node_properties": '{"MUSTER_SPEC": 1}'}])
     before = now()
+    lift_whole(url)
     with opened().session() as session:
         start = session.get_one(RetentionStart, 1)
         assert before - 1 <= start.since <= now()
@@ -156,7 +160,6 @@ def test_an_older_database_begins_with_retention_at_its_upgrade(url: str, opened
         assert native == {"open": True, "over": True, "batch": False, "damaged": True}
         uses = {(each.job_id, each.run) for each in session.scalars(select(RunUse))}
         assert uses == {("open", "read"), ("open", "teacher"), ("open", "parent")}
-    migrate(url, "downgrade", "0017")
 
 
 def test_a_new_database_has_nothing_to_count_from(opened: Callable[[], Database]) -> None:
@@ -165,30 +168,29 @@ def test_a_new_database_has_nothing_to_count_from(opened: Callable[[], Database]
 
 
 def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, opened: Callable[[], Database]) -> None:
-    migrate(url, "upgrade", "0003")
+    make_older(url, "0003")
     facts = {**OLD, "node_properties": '{"numNodes": 1}', "status": "RUNNABLE", "created_at": 5, "attempts_allowed": 3}
     family = (("p", "array", None), ("p:0", "container", "p"), ("alone", "container", None))
     rows = [{"id": name, "run": name, "kind": kind, "parent": parent} for name, kind, parent in family]
     insert(url, "jobs", [{**facts, "tags": '{"a": "b"}', **row} for row in rows])
+    lift_whole(url)
     with opened().session() as session:
         stored = dict(session.execute(text("SELECT id, node_properties IS NULL FROM jobs")).tuples().all())
         assert {name: bool(shared) for name, shared in stored.items()} == {"p": False, "p:0": True, "alone": False}
         for name in ("p", "p:0", "alone"):
             job_ = session.get_one(Job, name)
             assert (job_.node_properties, job_.tags, job_.parameters) == ({"numNodes": 1}, {"a": "b"}, {})
-    migrate(url, "downgrade", "0003")
-    with connected(url) as connection:
-        assert connection.scalar(text("SELECT count(*) FROM jobs WHERE node_properties IS NULL")) == 0
 
 
 def test_runs_of_an_older_database_belong_to_their_first_job_s_owner(url: str, opened: Callable[[], Database]) -> None:
-    migrate(url, "upgrade", "0004")
+    make_older(url, "0004")
     facts = {**OLD, "status": "FAILED", "attempts_allowed": 1}
     found = [("a", "lab", "key x/1/2", 1), *((run, "default", None, epoch) for run, epoch in (("a", 2), ("b", 1)))]
     found.append(("c", "lab", None, None))
     columns = ("run", "queue", "idempotency_key", "first_epoch")
     rows = [{"id": f"j{i}", "created_at": i, **dict(zip(columns, row, strict=True))} for i, row in enumerate(found)]
     insert(url, "jobs", [{**facts, **row} for row in rows])
+    lift_whole(url)
     with opened().session() as session:
         runs = {run.name: (run.queue, run.owner) for run in session.scalars(select(RunRecord))}
         assert runs == {"a": ("lab", "key x"), "b": ("default", None)}  # c never started: there is no run of it
@@ -202,12 +204,32 @@ def test_sqlite_watches_what_refers_to_what(tmp_path: Path) -> None:
     database.close()
 
 
-def test_down_and_up_again_leaves_the_tables_as_they_are(url: str, opened: Callable[[], Database]) -> None:
-    opened().close()
-    migrate(url, "downgrade", "0001")
-    migrate(url, "downgrade", "base")
-    with opened().engine.connect() as connection:
-        assert compare_metadata(MigrationContext.configure(connection), Base.metadata) == []
+@pytest.mark.parametrize("revision", ["0020", "0001", None])
+def test_an_older_database_is_refused_with_the_command_that_lifts_it(url: str, revision: str | None) -> None:
+    make_older(url, revision or "0001")
+    if revision is None:
+        with connected(url) as connection:
+            connection.execute(text("DROP TABLE alembic_version"))
+    with pytest.raises(
+        DatabaseError, match=r"lift it, in a clone of Muster, with: python -m docs\.tools\.lift_database"
+    ):
+        Database(url)
+    lift_whole(url)
+    lift_whole(url)
+    Database(url).close()
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("none.db", "there is no such file"), ("newer.db", "not a database of an older Muster")]
+)
+def test_what_is_not_an_older_database_is_not_lifted(tmp_path: Path, name: str, words: str) -> None:
+    database = Database(f"sqlite:///{tmp_path}/newer.db")
+    with database.engine.begin() as connection:
+        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
+    database.close()
+    command = [sys.executable, "-m", "docs.tools.lift_database", str(tmp_path / name)]
+    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
+    assert done.returncode == 2 and words in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_a_database_of_a_newer_version_is_refused_in_one_line(url: str, opened: Callable[[], Database]) -> None:

@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from alembic import command
-from alembic.config import Config
 from sqlalchemy import Connection, create_engine
 
-from orchestrator.persistence.schema import MIGRATIONS
+from docs.tools.lift_database import LiftedDatabase, lift
 
 
-def migrate(url: str, direction: str, revision: str) -> None:
-    """``upgrade`` or ``downgrade`` the database to that revision of its tables."""
-    config = Config()
-    config.set_main_option("script_location", str(MIGRATIONS))
+def make_older(url: str, revision: str) -> None:
+    """Bring the database to that revision of an older version's tables."""
     with connected(url) as connection:
-        config.attributes["connection"] = connection
-        getattr(command, direction)(config, revision)
+        lift(connection, revision)
+
+
+def lift_whole(url: str) -> None:
+    """Bring an older version's database to the tables of today, as the command does."""
+    LiftedDatabase(url).close()
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.layout import Store
 from shared_store.volume.metrics import read_metrics
 from tests.conftest import PATIENCE
+from tests.support.former.archive import lift_database
 from tests.support.former.environment import COMMIT, is_in_history, make_environment
 from tests.support.former.serving import FormerServing, KeyServing, create_key
 from tests.support.former.specs import TRAINING
@@ -83,6 +84,7 @@ def upgraded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Upgraded]:
     except BaseException:
         former.close()
         raise
+    lift_database(home)
     with KeyServing(home, "--cpus", "4", key=key) as server:
         assert {str(each) for each in gang_members(home)} >= before, "the nodes ran on"
         yield Upgraded(server, jobs, session)

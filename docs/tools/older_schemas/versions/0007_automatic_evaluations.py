@@ -21,7 +21,3 @@ def upgrade() -> None:
         sa.Column("problem", sa.String()),
     )
     op.create_index("ix_automatic_evaluations_open", "automatic_evaluations", ["open"])
-
-
-def downgrade() -> None:
-    op.drop_table("automatic_evaluations")

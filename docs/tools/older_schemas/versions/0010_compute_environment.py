@@ -8,7 +8,3 @@ down_revision = "0009"
 
 def upgrade() -> None:
     op.execute("ALTER TABLE attempts RENAME COLUMN pool TO compute_environment")
-
-
-def downgrade() -> None:
-    op.execute("ALTER TABLE attempts RENAME COLUMN compute_environment TO pool")

@@ -52,8 +52,3 @@ def upgrade() -> None:
         sa.Column("exit_code", sa.BigInteger()),
         sa.Column("nodes", sa.JSON(), nullable=False),
     )
-
-
-def downgrade() -> None:
-    for table in ("attempts", "jobs", "job_definitions"):
-        op.drop_table(table)

@@ -21,7 +21,3 @@ def upgrade() -> None:
     )
     op.create_index("ix_webhook_deliveries_due", "webhook_deliveries", ["webhook", "next_at"])
     op.create_index("ix_webhook_deliveries_job", "webhook_deliveries", ["job"])
-
-
-def downgrade() -> None:
-    op.drop_table("webhook_deliveries")

@@ -9,7 +9,3 @@ down_revision = "0015"
 
 def upgrade() -> None:
     op.add_column("job_queues", sa.Column("sent_order", sa.JSON(), nullable=True))
-
-
-def downgrade() -> None:
-    op.drop_column("job_queues", "sent_order")

@@ -12,7 +12,3 @@ def upgrade() -> None:
     op.create_index(
         "ix_jobs_owned", "jobs", ["name", "owner", "created_at"], sqlite_where=where, postgresql_where=where
     )
-
-
-def downgrade() -> None:
-    op.drop_index("ix_jobs_owned", "jobs")

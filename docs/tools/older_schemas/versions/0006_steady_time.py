@@ -21,10 +21,3 @@ def upgrade() -> None:
     # at its beginning steady time is the wall clock's
     op.execute("UPDATE jobs SET queued_since = created_at WHERE status NOT IN ('SUCCEEDED', 'FAILED')")
     op.execute("UPDATE attempts SET held_since = created_at, running_since = started_at WHERE stopped_at IS NULL")
-
-
-def downgrade() -> None:
-    op.drop_column("attempts", "running_since")
-    op.drop_column("attempts", "held_since")
-    op.drop_column("jobs", "queued_since")
-    op.drop_table("clock")

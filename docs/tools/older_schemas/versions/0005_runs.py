@@ -31,8 +31,3 @@ def upgrade() -> None:
         sa.Column("created_at", sa.BigInteger(), nullable=False),
     )
     op.execute(_FIRST_JOBS)
-
-
-def downgrade() -> None:
-    op.drop_table("runs")
-    op.drop_column("jobs", "owner")

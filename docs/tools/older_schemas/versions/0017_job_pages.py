@@ -30,10 +30,3 @@ def upgrade() -> None:
 def _create(name: str, columns: list[str], within: str) -> None:
     where = sa.text(within)
     op.create_index(name, "jobs", columns, sqlite_where=where, postgresql_where=where)
-
-
-def downgrade() -> None:
-    for name in (*_NEW, "ix_jobs_parent"):
-        op.drop_index(name, "jobs")
-    for name, columns in _OLD.items():
-        op.create_index(name, "jobs", columns)

@@ -18,7 +18,3 @@ def upgrade() -> None:
         sa.Column("used_at", sa.BigInteger(), nullable=False),
         sa.PrimaryKeyConstraint("sha256"),
     )
-
-
-def downgrade() -> None:
-    op.drop_table("kept_texts")

@@ -46,15 +46,6 @@ def upgrade() -> None:
         op.bulk_insert(uses, found)
 
 
-def downgrade() -> None:
-    op.drop_table("run_uses")
-    op.drop_index("ix_jobs_definition", "jobs")
-    op.drop_index("ix_jobs_ended", "jobs")
-    op.create_index("ix_jobs_stopped_at", "jobs", ["stopped_at"])
-    op.drop_column("jobs", "from_yaml")
-    op.drop_table("retention")
-
-
 def _uses(properties: str) -> list[dict[str, object]]:
     """The runs that a job reads, or begins with the weights of. Damage names none."""
     found: set[str] = set()

@@ -11,8 +11,3 @@ def upgrade() -> None:
     where = sa.text("parent IS NULL")
     op.create_index("ix_jobs_named", "jobs", ["name", "created_at"], sqlite_where=where, postgresql_where=where)
     op.drop_index("ix_jobs_name", "jobs")
-
-
-def downgrade() -> None:
-    op.create_index("ix_jobs_name", "jobs", ["name"])
-    op.drop_index("ix_jobs_named", "jobs")

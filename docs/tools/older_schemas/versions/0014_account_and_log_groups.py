@@ -37,12 +37,3 @@ def upgrade() -> None:
     op.add_column("nodes", sa.Column("log_group", sa.String(), nullable=True))
     op.add_column("nodes", sa.Column("log_prefix", sa.String(), nullable=True))
     op.create_index("ix_nodes_log_group", "nodes", ["log_group"])
-
-
-def downgrade() -> None:
-    op.drop_index("ix_nodes_log_group", "nodes")
-    op.drop_column("nodes", "log_prefix")
-    op.drop_column("nodes", "log_group")
-    op.drop_table("log_streams")
-    op.drop_table("log_groups")
-    op.drop_table("account")

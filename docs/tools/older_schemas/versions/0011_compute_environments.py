@@ -8,7 +8,3 @@ down_revision = "0010"
 
 def upgrade() -> None:
     op.execute("ALTER TABLE job_queues RENAME COLUMN environments TO compute_environments")
-
-
-def downgrade() -> None:
-    op.execute("ALTER TABLE job_queues RENAME COLUMN compute_environments TO environments")

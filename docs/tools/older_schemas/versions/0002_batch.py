@@ -95,19 +95,3 @@ def upgrade() -> None:
     op.bulk_insert(environments, [{**created, "name": "local", "document": {"type": "UNMANAGED"}}])
     queue = {"priority": 1, "environments": ["local"], "policy": None, "limits": [], "deleting": False}
     op.bulk_insert(queues, [{**created, **queue, "name": "default"}])
-
-
-def downgrade() -> None:
-    with op.batch_alter_table("attempts") as attempts:
-        for column in _attempt_columns():
-            attempts.drop_column(column.name)
-    with op.batch_alter_table("jobs") as jobs:
-        jobs.create_index("ix_jobs_queue", ["queue"])
-        for name in ("queue_created", "queue_status", "stopped_at", "parent"):
-            jobs.drop_index(f"ix_jobs_{name}")
-        jobs.drop_constraint("uq_jobs_idempotency_key", type_="unique")
-        for column in _job_columns():
-            jobs.drop_column(column.name)
-    op.drop_column("job_definitions", "tags")
-    for table in ("share_usage", "dependencies", "scheduling_policies", "compute_environments", "job_queues"):
-        op.drop_table(table)

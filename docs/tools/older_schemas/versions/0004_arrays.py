@@ -15,13 +15,3 @@ def upgrade() -> None:
             jobs.alter_column(name, existing_type=sa.JSON(), nullable=True)
     cleared = ", ".join(f"{name} = NULL" for name in _SHARED)
     op.execute(f"UPDATE jobs SET {cleared} WHERE parent IN (SELECT id FROM jobs WHERE kind = 'array')")
-
-
-def downgrade() -> None:
-    copied = ", ".join(
-        f"{name} = (SELECT array_.{name} FROM jobs AS array_ WHERE array_.id = jobs.parent)" for name in _SHARED
-    )
-    op.execute(f"UPDATE jobs SET {copied} WHERE parent IS NOT NULL AND node_properties IS NULL")
-    with op.batch_alter_table("jobs") as jobs:
-        for name in _SHARED:
-            jobs.alter_column(name, existing_type=sa.JSON(), nullable=False)

@@ -98,26 +98,3 @@ def _row(entry: dict[str, Any]) -> dict[str, Any]:
 def _storable(text: str | None) -> str | None:
     """JSON can hold a zero byte and half of a character, a column of text can't."""
     return None if text is None else text.replace("\0", "\\x00").encode(errors="backslashreplace").decode()
-
-
-def downgrade() -> None:
-    connection = op.get_bind()
-    op.add_column("attempts", sa.Column("nodes", sa.JSON()))
-    nodes = sa.table("nodes", *(sa.column(name) for name in ("job_id", "attempt", "node_index", *_KEYS)))
-    connection.execute(sa.update(_ATTEMPTS).values(nodes=[]))
-    found: dict[tuple[str, int], list[dict[str, Any]]] = {}
-    for row in connection.execute(sa.select(nodes).order_by(nodes.c.job_id, nodes.c.attempt, nodes.c.node_index)):
-        said = {key: getattr(row, column) for column, key in _KEYS.items()}
-        told = {key: value for key, value in said.items() if value is not None}
-        if told.pop("met"):
-            told["met"] = True
-        told |= {name: told[name].split(",") if told[name] else [] for name in _LISTS if name in told}
-        if "exitCode" in told:
-            told.setdefault("error", None)
-        found.setdefault((row.job_id, row.attempt), []).append({"index": row.node_index, **told})
-    for (job, number), entries in found.items():
-        which = (_ATTEMPTS.c.job_id == job) & (_ATTEMPTS.c.number == number)
-        connection.execute(sa.update(_ATTEMPTS).where(which).values(nodes=entries))
-    with op.batch_alter_table("attempts") as table:
-        table.alter_column("nodes", existing_type=sa.JSON(), nullable=False)
-    op.drop_table("nodes")

@@ -23,8 +23,3 @@ def upgrade() -> None:
         sa.Column("share", sa.String(), nullable=False),
         sa.Column("created_at", sa.BigInteger(), nullable=False),
     )
-
-
-def downgrade() -> None:
-    for table in ("access_keys", "sealed_secrets"):
-        op.drop_table(table)

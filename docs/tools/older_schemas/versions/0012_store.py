@@ -14,7 +14,3 @@ def upgrade() -> None:
         sa.Column("identity", sa.String(), nullable=False),
         sa.PrimaryKeyConstraint("id"),
     )
-
-
-def downgrade() -> None:
-    op.drop_table("store")

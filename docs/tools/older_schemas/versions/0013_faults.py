@@ -9,7 +9,3 @@ down_revision = "0012"
 
 def upgrade() -> None:
     op.add_column("attempts", sa.Column("fault", sa.String(), nullable=True))
-
-
-def downgrade() -> None:
-    op.drop_column("attempts", "fault")

@@ -9,7 +9,3 @@ down_revision = "0002"
 
 def upgrade() -> None:
     op.add_column("job_definitions", sa.Column("owner", sa.String()))
-
-
-def downgrade() -> None:
-    op.drop_column("job_definitions", "owner")
