@@ -102,7 +102,7 @@ class Timed(TrainingView):
 
     read = 0
 
-    def _newest(self, shown: screen.Screen | None) -> Rows | None:
+    def _newest(self, shown: screen.Screen) -> Rows | None:
         rows = super()._newest(shown)
         Timed.read = time.time_ns()
         return rows

@@ -38,7 +38,7 @@ def main() -> int:
         raise UserError(f"{run.recordings}: it can't be made ({error.strerror or error})") from error
     target = run.recordings / f"{rollout.checkpoint.name}-{(job.id or 'job')[:8]}.mcap"
     recording = Recording(target, stage, rollout.facts(), rollout.attachments())
-    recording.say(
+    recording.log(
         f"checkpoint {rollout.checkpoint.name} of run {run.name}: {counted(worlds, 'world')}, {counted(episodes, 'episode')} of each"
     )
     most = episodes * rollout.task.max_episode_length

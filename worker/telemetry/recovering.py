@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 from worker.settings.errors import UserError
 from worker.telemetry.intact_records import LIBRARY, SoundRecords, with_checksum
 from worker.telemetry.recording import CHUNK, PARTIAL, writer_to
 
 
-@dataclass(frozen=True)
-class Recovered:
-    """What :func:`recover` made.
-
-    Attributes:
-        path: The readable file.
-        messages: How many it has.
-        losses: What is lost, in words; empty where nothing is but the end of a file that was cut short.
-    """
+class Recovered(NamedTuple):
+    """What :func:`recover` made."""
 
     path: Path
+    """The readable file."""
     messages: int
     losses: str
+    """What is lost, in words; empty where nothing is but the end of a file that was cut short."""
 
 
 def recover(partial: Path) -> Recovered | None:
@@ -35,10 +30,9 @@ def recover(partial: Path) -> Recovered | None:
     Raises:
         UserError: There is no such file, or no control step in it can be read.
     """
-    if not partial.exists():
-        raise UserError(f"{partial}: there is no such file; a recording that was cut short ends on .mcap{PARTIAL}")
     if not partial.is_file():
-        raise UserError(f"{partial}: it is not a file; a recording that was cut short ends on .mcap{PARTIAL}")
+        why = "it is not a file" if partial.exists() else "there is no such file"
+        raise UserError(f"{partial}: {why}; a recording that was cut short ends on .mcap{PARTIAL}")
     if not os.access(partial, os.R_OK):
         raise UserError(f"{partial}: it can't be read (Permission denied)")
     name = partial.name.removesuffix(PARTIAL)
@@ -72,29 +66,31 @@ def _copy(records: SoundRecords, target: Path) -> tuple[int, int]:
     channels: dict[int, int] = {}
     stepping: set[int] = set()
     count = steps = size = 0
-    with target.open("wb") as made:
-        writer = writer_to(made)
+    with target.open("wb") as file:
+        writer = writer_to(file)
         writer.start("ros2", LIBRARY)
         for record in records:
-            if isinstance(record, Schema):
-                if record.id not in schemas:
-                    schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
-            elif isinstance(record, Channel):
-                if record.id not in channels:
-                    own = record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
-                    channels[record.id] = writer.register_channel(*own)
-                    stepping |= {record.id} if record.topic.endswith("/rl/step") else set()
-            elif isinstance(record, Message):
-                where = channels[record.channel_id], record.log_time, record.data, record.publish_time
-                writer.add_message(*where, record.sequence)
-                count, steps = count + 1, steps + (record.channel_id in stepping)
-                size += len(record.data)
-                if size > CHUNK and steps:  # what stands before the first step is one chunk
-                    writer.flush()
-                    size = 0
-            elif isinstance(record, Attachment):
-                writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
-            elif isinstance(record, Metadata):
-                writer.add_metadata(record.name, with_checksum(record.name, record.metadata))
+            match record:
+                case Schema():
+                    if record.id not in schemas:
+                        schemas[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+                case Channel():
+                    if record.id not in channels:
+                        own = record.topic, record.message_encoding, schemas[record.schema_id], record.metadata
+                        channels[record.id] = writer.register_channel(*own)
+                        stepping |= {record.id} if record.topic.endswith("/rl/step") else set()
+                case Message():
+                    where = channels[record.channel_id], record.log_time, record.data, record.publish_time
+                    writer.add_message(*where, record.sequence)
+                    count, steps = count + 1, steps + (record.channel_id in stepping)
+                    size += len(record.data)
+                    if size > CHUNK and steps:  # what stands before the first step is one chunk
+                        writer.flush()
+                        size = 0
+                case Attachment():
+                    times = record.create_time, record.log_time
+                    writer.add_attachment(*times, record.name, record.media_type, record.data)
+                case Metadata():
+                    writer.add_metadata(record.name, with_checksum(record.name, record.metadata))
         writer.finish()
     return count, steps

@@ -34,7 +34,7 @@ class RecordedSteps:
         steps: Numbers, from 1.
         poses: Shape ``(steps, worlds, links, 7)``: position [m] and quaternion xyzw in the frame of the world.
         rewards: Weighted terms, mean of the worlds; shape ``(steps, terms)``.
-        said: Lines of the log: time [ns], who, text.
+        log: Lines of the log: time [ns], source, text.
         returns: Of episodes that ended: time [ns], return.
         images: By camera and step, PNG of each world; steps of which none is there, or not of every world, have none.
     """
@@ -43,12 +43,12 @@ class RecordedSteps:
     steps: np.ndarray
     poses: np.ndarray
     rewards: np.ndarray
-    said: list[tuple[int, str, str]]
+    log: list[tuple[int, str, str]]
     returns: list[tuple[int, float]]
     images: dict[str, dict[int, list[bytes]]] = field(default_factory=dict)
 
     def pictures(self, camera: str) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Times, numbers and images of the steps of which a camera has images, as :meth:`worker.telemetry.screen.Screen.pictures` takes them."""
+        """Times, numbers and images of the steps of which a camera has images, as :meth:`worker.telemetry.screen.Screen.images` takes them."""
         from PIL import Image
 
         found = self.images.get(camera, {})
@@ -127,7 +127,7 @@ class Replay:
                     found.move(time, _decoded(kind, data).transforms)
                 elif topic == "/rosout":
                     line = _decoded(kind, data)
-                    found.said.append((time, line.name, line.msg))
+                    found.log.append((time, line.name, line.msg))
                 elif topic.endswith("/rl/step") and found.times:
                     found.step(time, _decoded(kind, data))
                 elif (seen := _IMAGES.fullmatch(topic)) and found.times:
@@ -145,7 +145,7 @@ class Replay:
             for camera, steps in found.images.items()
         }
         return RecordedSteps(
-            np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns, images
+            np.array(found.times), steps, np.array(found.poses), rewards, found.log, found.returns, images
         )
 
     @contextmanager
@@ -195,7 +195,7 @@ class _Gathered:
     times: list[int] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)
     rewards: list[list[np.ndarray]] = field(default_factory=list)
-    said: list[tuple[int, str, str]] = field(default_factory=list)
+    log: list[tuple[int, str, str]] = field(default_factory=list)
     returns: list[tuple[int, float]] = field(default_factory=list)
     images: defaultdict[str, defaultdict[int, list[bytes]]] = field(
         default_factory=lambda: defaultdict(lambda: defaultdict(list))

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from shared_store.contract.error_text import counted
 
 if TYPE_CHECKING:
     from worker.tasks.run.task import Task
@@ -52,34 +55,32 @@ class Layout:
     def of(cls, task: Task, worlds: int, rows: int, images: bool = True) -> Layout:
         """That of a task's first ``worlds`` worlds, with the images of its cameras or without."""
         arrays = task.worlds.arrays
-        actions = tuple(task.action_names) if not task.discrete else ("choice",)
-        names = tuple(task.observation_names), actions, tuple(task.reward_terms)
-        numbers = worlds, rows, arrays.joint_q.shape[1], arrays.joint_qd.shape[1]
-        shapes = {name: tuple(tensor.shape[1:]) for name, tensor in task.groups.items() if tensor.ndim == 4}
-        # the present frame comes first; of masks and the like that are not colours, the first channel is shown
-        seen = (
-            tuple((name, 3 if shape[0] % 3 == 0 else 1, shape[1], shape[2]) for name, shape in shapes.items())
-            if images
-            else ()
+        shapes = {name: tensor.shape[1:] for name, tensor in task.groups.items() if images and tensor.ndim == 4}
+        return cls(
+            worlds,
+            rows,
+            arrays.joint_q.shape[1],
+            arrays.joint_qd.shape[1],
+            tuple(task.observation_names),
+            ("choice",) if task.discrete else tuple(task.action_names),
+            tuple(task.reward_terms),
+            task.config.control_hz,
+            # the present frame comes first; of masks and the like that are not colours, the first channel is shown
+            tuple((name, 3 if shape[0] % 3 == 0 else 1, shape[1], shape[2]) for name, shape in shapes.items()),
+            tuple(task.ended.names),
         )
-        return cls(*numbers, *names, task.config.control_hz, seen, tuple(task.ended.names))
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> Layout:
-        """Reads the text of :meth:`to_json`."""
+        """A layout from :func:`dataclasses.asdict` and JSON."""
         names = {name: tuple(value[name]) for name in ("observations", "actions", "terms", "causes")}
         return cls(**{**value, **names, "images": tuple(map(tuple, value["images"]))})
 
-    def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
-
     @property
-    def ends(self) -> tuple[int, int, int, int, int, int]:
-        """The column behind each part, in order."""
+    def ends(self) -> tuple[int, ...]:
+        """The column behind each of the six parts, in order."""
         sizes = (self.coordinates, self.dofs, len(self.observations), len(self.actions), len(self.terms), 1)
-        first, second, third, fourth, fifth, sixth = np.cumsum(sizes).tolist()
-        return first, second, third, fourth, fifth, sixth
+        return tuple(accumulate(sizes))
 
     @property
     def width(self) -> int:
@@ -101,55 +102,36 @@ class Rows:
         first: Number of the first step since the tap began.
         values: Shape ``(steps, worlds, layout.width)``, float32.
         marks: Shape ``(steps, worlds, len(MARKS))``, int32.
+        images: The present frames of ``layout.images`` one after the other, shape ``(steps, worlds, layout.image_bytes)``, uint8.
         lost: Steps before ``first`` that were overwritten before they were read.
-        images: The present frames of ``layout.images`` one after the other, shape ``(steps, worlds, layout.image_bytes)``, uint8; None
-            where the layout has none.
     """
 
     layout: Layout
     first: int
     values: np.ndarray
     marks: np.ndarray
+    images: np.ndarray
     lost: int = 0
-    images: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.values)
 
-    def part(self, number: int) -> np.ndarray:
-        """The columns of a part, numbered as in :attr:`Layout.ends`; shape ``(steps, worlds, columns)``."""
+    def _part(self, number: int) -> np.ndarray:
         ends = (0, *self.layout.ends)
         return self.values[:, :, ends[number] : ends[number + 1]]
 
-    @property
-    def coordinates(self) -> np.ndarray:
-        """Joint coordinates, shape ``(steps, worlds, coordinates)``."""
-        return self.part(0)
-
-    @property
-    def velocities(self) -> np.ndarray:
-        """Joint velocities, shape ``(steps, worlds, dofs)``."""
-        return self.part(1)
-
-    @property
-    def observations(self) -> np.ndarray:
-        """Observations after the step, shape ``(steps, worlds, observations)``."""
-        return self.part(2)
-
-    @property
-    def actions(self) -> np.ndarray:
-        """The policy's actions, shape ``(steps, worlds, actions)``."""
-        return self.part(3)
-
-    @property
-    def terms(self) -> np.ndarray:
-        """Weighted reward terms, shape ``(steps, worlds, terms)``."""
-        return self.part(4)
-
-    @property
-    def rewards(self) -> np.ndarray:
-        """Shape ``(steps, worlds)``."""
-        return self.part(5)[:, :, 0]
+    coordinates = property(lambda self: self._part(0))
+    """Joint coordinates, shape ``(steps, worlds, coordinates)``."""
+    velocities = property(lambda self: self._part(1))
+    """Joint velocities, shape ``(steps, worlds, dofs)``."""
+    observations = property(lambda self: self._part(2))
+    """Observations after the step, shape ``(steps, worlds, observations)``."""
+    actions = property(lambda self: self._part(3))
+    """The policy's actions, shape ``(steps, worlds, actions)``."""
+    terms = property(lambda self: self._part(4))
+    """Weighted reward terms, shape ``(steps, worlds, terms)``."""
+    rewards = property(lambda self: self._part(5)[:, :, 0])
+    """Shape ``(steps, worlds)``."""
 
     def mark(self, name: str) -> np.ndarray:
         """One of :data:`MARKS`, shape ``(steps, worlds)``."""
@@ -159,11 +141,14 @@ class Rows:
         """Cause of the end of the episode that ended in this step; in any other step, of the world's last episode."""
         return self.layout.causes[int(self.mark("cause")[step, world])]
 
+    def end_of_episode(self, step: int, world: int, number: int, total: float, length: int) -> str:
+        """A line about the episode ``number`` of a world that ended in this step, with its return and its length [control steps]."""
+        cause = self.cause(step, world)
+        return f"world {world}: episode {number} ended by {cause} after {counted(length, 'step')}, return {total:.4g}"
+
     def pictures(self, step: int) -> dict[str, np.ndarray]:
         """The image of each camera after a step, by its group: uint8, ``(worlds, height, width, 3)`` or ``(worlds, height, width)``."""
         found: dict[str, np.ndarray] = {}
-        if self.images is None:
-            return found
         start = 0
         for name, channels, height, width in self.layout.images:
             end = start + channels * height * width
@@ -174,6 +159,5 @@ class Rows:
 
     def of_worlds(self, worlds: int, since: int = 0) -> Rows:
         """Those of the first ``worlds`` worlds, with steps numbered from step ``since``."""
-        images = None if self.images is None else self.images[:, :worlds]
-        parts = self.values[:, :worlds], self.marks[:, :worlds], self.lost, images
-        return Rows(replace(self.layout, worlds=worlds), self.first - since, *parts)
+        parts = (each[:, :worlds] for each in (self.values, self.marks, self.images))
+        return Rows(replace(self.layout, worlds=worlds), self.first - since, *parts, self.lost)

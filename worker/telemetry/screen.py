@@ -6,7 +6,6 @@ On the timeline ``time`` are wall-clock times; of a recording its own ones. ``it
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -20,7 +19,8 @@ os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is s
 
 import rerun as rr
 import rerun.blueprint as rrb
-from PIL import Image
+
+from worker.telemetry.messages import png
 
 _ROOT, _MIDDLE = "world", "middle"
 """Frames: of all worlds, and of what the eye follows."""
@@ -63,25 +63,22 @@ class Screen:
         server: Its URL, or the path of an .rrd file.
         title: What is shown, in a few words.
         look: Of the worlds.
-        start: Joint frames with which the eye is placed, shape ``(worlds, links, 7)``.
         live: Whether the newest state is followed; otherwise it is played from its beginning.
     """
 
-    def __init__(self, server: str | Path, title: str, look: Appearance, start: np.ndarray, live: bool) -> None:
-        self._look = look
+    def __init__(self, server: str | Path, title: str, look: Appearance, live: bool) -> None:
+        self._look, self._live, self._is_aimed = look, live, False
         self._terms: list[tuple[np.ndarray, np.ndarray, np.ndarray, int | None]] = []
         """The rows that :meth:`frames` has not sent yet: times, steps, reward terms, iteration."""
         self._rr = rr.RecordingStream("muster")
         self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
         self._rr.send_recording_name(title)
-        self._stand()
-        center, position = _eye(self._placed(start[None])[0])
-        self._rr.send_blueprint(_blueprint(center, position, look.cameras, live), make_default=True)
+        self._log_fixed()
 
     def frames(
         self, times: np.ndarray, steps: np.ndarray, poses: np.ndarray, rewards: np.ndarray, iteration: int | None = None
     ) -> None:
-        """Show control steps.
+        """Show control steps; with the first of all, the eye is placed.
 
         Args:
             times: Of each [ns since 1970], shape ``(steps,)``.
@@ -93,6 +90,9 @@ class Screen:
         if not len(times):
             return
         placed = self._placed(poses)
+        if not self._is_aimed:
+            self._is_aimed = True
+            self._rr.send_blueprint(_blueprint(placed[0], self._look.cameras, self._live), make_default=True)
         frames = [_frame(world, link) for world in range(poses.shape[1]) for link in self._look.links]
         middle = np.zeros((len(times), 1, 7))
         middle[:, 0, :3], middle[:, 0, 6] = placed[..., :3].mean((1, 2)), 1.0
@@ -109,7 +109,7 @@ class Screen:
         if sum(len(each[0]) for each in self._terms) >= _TERMS:
             self._send_terms()
 
-    def pictures(
+    def images(
         self,
         camera: str,
         times: np.ndarray,
@@ -117,7 +117,7 @@ class Screen:
         seen: Sequence[np.ndarray],
         iteration: int | None = None,
     ) -> None:
-        """Show what a camera saw in all worlds, as one picture of tiles.
+        """Show what a camera saw in all worlds, as one image of tiles.
 
         Args:
             camera: One of the look's.
@@ -129,7 +129,7 @@ class Screen:
         if not len(times):
             return
         columns = rr.EncodedImage.columns(
-            blob=[_png(tiled(each)) for each in seen], media_type=["image/png"] * len(seen)
+            blob=[png(tiled(each)) for each in seen], media_type=["image/png"] * len(seen)
         )
         self._rr.send_columns(f"images/{camera}", _index(times, steps, iteration), columns)
 
@@ -152,12 +152,14 @@ class Screen:
         if len(values) and index:
             self._rr.send_columns(f"return/{name}", index, rr.Scalars.columns(scalars=np.asarray(values, np.float64)))
 
-    def say(self, lines: Iterable[tuple[int, str, str]]) -> None:
-        """Add lines of the log: time [ns since 1970], who says it, text."""
+    def log(self, lines: Iterable[tuple[int, str, str]]) -> None:
+        """Add lines of the log: time [ns since 1970], source, text."""
         found = list(lines)
         if found:
             times = np.array([time for time, _, _ in found]).astype("datetime64[ns]")
-            texts = [f"{str(time)[11:19]}  {who}  {text}" for time, (_, who, text) in zip(times, found, strict=True)]
+            texts = [
+                f"{str(time)[11:19]}  {source}  {text}" for time, (_, source, text) in zip(times, found, strict=True)
+            ]
             self._rr.send_columns("log", [rr.TimeColumn("time", timestamp=times)], rr.TextLog.columns(text=texts))
 
     def close(self) -> None:
@@ -167,8 +169,8 @@ class Screen:
             self._rr.flush(timeout_sec=5.0)
             self._rr.disconnect()
 
-    def _stand(self) -> None:
-        """The parts that do not move."""
+    def _log_fixed(self) -> None:
+        """Log the parts that do not move."""
         self._rr.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._rr.log(
             "worlds/middle", rr.Points3D([[0.0, 0.0, 0.0]], radii=0.001), rr.CoordinateFrame(_MIDDLE), static=True
@@ -177,21 +179,21 @@ class Screen:
         self._rr.log("terms", rr.SeriesLines(names=list(self._look.terms), colors=colors), static=True)
         for name, data in self._look.shapes.items():
             shape = rr.Asset3D(contents=data, media_type="model/gltf-binary")
-            if name == "ground":
-                self._rr.log("ground", shape, rr.CoordinateFrame("ground"), static=True)
-                self._fix("ground", np.zeros(3))
-                continue
-            for world, place in enumerate(self._look.places):
-                entity = f"worlds/world_{world}/{name.replace('/', '_') or 'fixed'}"
-                self._rr.log(entity, shape, rr.CoordinateFrame(_frame(world, name)), static=True)
-                if not name:
-                    self._fix(_frame(world, name), place)
-
-    def _fix(self, frame: str, place: np.ndarray) -> None:
-        """A frame of shapes that do not move."""
-        upright = rr.Quaternion(xyzw=_UPRIGHT)
-        where = rr.Transform3D(translation=place, quaternion=upright, child_frame=frame, parent_frame=_ROOT)
-        self._rr.log(f"fixed/{frame}", where, static=True)
+            entity, is_ground = name.replace("/", "_") or "fixed", name == "ground"
+            worlds = (
+                [("ground", "ground", np.zeros(3))]
+                if is_ground
+                else [
+                    (f"worlds/world_{world}/{entity}", _frame(world, name), place)
+                    for world, place in enumerate(self._look.places)
+                ]
+            )
+            for path, frame, place in worlds:
+                self._rr.log(path, shape, rr.CoordinateFrame(frame), static=True)
+                if is_ground or not name:
+                    upright = rr.Quaternion(xyzw=_UPRIGHT)
+                    where = rr.Transform3D(translation=place, quaternion=upright, child_frame=frame, parent_frame=_ROOT)
+                    self._rr.log(f"fixed/{frame}", where, static=True)
 
     def _placed(self, poses: np.ndarray) -> np.ndarray:
         """Poses of the shapes, which are y-up, with the worlds beside each other."""
@@ -212,12 +214,6 @@ def tiled(images: np.ndarray) -> np.ndarray:
     return grid if images.ndim == 4 else grid[..., 0]
 
 
-def _png(image: np.ndarray) -> np.ndarray:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", compress_level=1)
-    return np.frombuffer(buffer.getvalue(), np.uint8)
-
-
 def _index(times: np.ndarray, steps: np.ndarray, iteration: int | None, rows: int = 1) -> list[rr.TimeColumn]:
     """The place of control steps on the timelines, with so many rows of each."""
     index = [rr.TimeColumn("time", timestamp=np.repeat(times, rows).astype("datetime64[ns]"))]
@@ -231,20 +227,13 @@ def _frame(world: int, link: str) -> str:
     return f"world_{world}/{link}" if link else f"world_{world}"
 
 
-def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Target and position of a camera that sees all worlds; ``placed``: shape ``(worlds, links, 7)``."""
+def _blueprint(placed: np.ndarray, cameras: Sequence[str], live: bool) -> rrb.Blueprint:
+    """The views, and an eye that sees all worlds; ``placed``: shape ``(worlds, links, 7)``."""
     low, high = placed[..., :3].min((0, 1)), placed[..., :3].max((0, 1))
     center = (low + high) / 2
     span = max(1.0, float(np.linalg.norm(high - low)))
-    return center, center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5])
-
-
-def _blueprint(center: np.ndarray, position: np.ndarray, cameras: Sequence[str], live: bool) -> rrb.Blueprint:
-    recent: Any = rrb.VisibleTimeRange(
-        "time",
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_RECENT),
-        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0),
-    )
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    recent: Any = rrb.VisibleTimeRange("time", start=cursor(seconds=-_RECENT), end=cursor(seconds=0))
     worlds = rrb.Spatial3DView(
         name="Worlds",
         contents=["/worlds/**", "/ground/**"],
@@ -252,7 +241,7 @@ def _blueprint(center: np.ndarray, position: np.ndarray, cameras: Sequence[str],
         spatial_information=rrb.SpatialInformation(_ROOT, show_axes=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=position,
+            position=center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5]),
             look_target=center,
             eye_up=(0, 0, 1),
             tracking_entity="/worlds/middle",

@@ -108,44 +108,45 @@ class Tap:
         if not 1 <= worlds <= most:
             raise ValueError(f"worlds is {worlds}; of these worlds 1 to {most} can be watched")
         self.layout = Layout.of(task, worlds, rows, images)
+        self.left_out = ""
+        """The message about images that are too large for the ring; empty if none is missing."""
         self._task, self.device = task, task.device
-        self._seen = [wp.from_torch(task.groups[name].view(task.world_count, -1)) for name, *_ in self.layout.images]
+        self._sources = [wp.from_torch(task.groups[name].view(task.world_count, -1)) for name, *_ in self.layout.images]
         with on_torch_stream(self.device):
-            self._values = wp.zeros((rows, worlds, self.layout.width), dtype=wp.float32, device=self.device)
-            self._marks = wp.zeros((rows, worlds, len(MARKS)), dtype=wp.int32, device=self.device)
-            self._images = wp.zeros((rows, worlds, self.layout.image_bytes), dtype=wp.uint8, device=self.device)
-            self._ended = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-            self._counter = wp.zeros(1, dtype=wp.int64, device=self.device)
+            self._values, self._marks, self._images, self._ended, self._counter = self._arrays = [
+                wp.zeros(shape, dtype=kind, device=self.device)
+                for shape, kind in (
+                    ((rows, worlds, self.layout.width), wp.float32),
+                    ((rows, worlds, len(MARKS)), wp.int32),
+                    ((rows, worlds, self.layout.image_bytes), wp.uint8),
+                    (worlds, wp.int32),
+                    (1, wp.int64),
+                )
+            ]
             self._ends = wp.array(self.layout.ends, dtype=wp.int32, device=self.device)
-        self.values: torch.Tensor = wp.to_torch(self._values)
-        self.marks: torch.Tensor = wp.to_torch(self._marks)
-        self.images: torch.Tensor = wp.to_torch(self._images)
-        self.count: torch.Tensor = wp.to_torch(self._counter)
+        tensors: list[torch.Tensor] = [wp.to_torch(each) for each in self._arrays]
+        self.values, self.marks, self.images, _, self.count = tensors
 
     @classmethod
     def within(cls, task: Task, worlds: int) -> Tap:
         """A ring whose images take at most :data:`IMAGE_MEMORY`: with fewer rows, or without images where too few would be left."""
         step = worlds * Layout.of(task, worlds, ROWS).image_bytes
         rows = min(ROWS, IMAGE_MEMORY // step) if step else ROWS
-        return cls(task, worlds, rows) if rows >= LEAST_ROWS else cls(task, worlds, images=False)
-
-    @property
-    def left_out(self) -> str:
-        """The message about images that are too large for the ring; empty if none is missing."""
-        worlds, most = self.layout.worlds, IMAGE_MEMORY // LEAST_ROWS
-        step = worlds * Layout.of(self._task, worlds, ROWS).image_bytes
-        if step == worlds * self.layout.image_bytes:
-            return ""
-        return (
+        if rows >= LEAST_ROWS:
+            return cls(task, worlds, rows)
+        tap = cls(task, worlds, images=False)
+        most = IMAGE_MEMORY / LEAST_ROWS
+        tap.left_out = (
             f"images are left out: of {worlds} worlds they take {step / 1e6:.1f} MB in each control step, and {most / 1e6:.1f} MB is the "
             "limit; fewer worlds (--worlds) or smaller images fit"
         )
+        return tap
 
     def open(self) -> None:
         """Have the task fill the ring from its next step on. A graph that holds the task's step has to be recorded anew."""
         with on_torch_stream(self.device):
             self._fill()  # loads the kernels, which a capture can't do everywhere
-            for array in (self._values, self._marks, self._images, self._ended, self._counter):
+            for array in self._arrays:
                 array.zero_()
         self._task.watch(self._fill)
 
@@ -160,7 +161,7 @@ class Tap:
         outputs = [self._values, self._marks]
         wp.launch(_fill, dim=shape, inputs=[*inputs, self._ended, self._counter], outputs=outputs, device=self.device)
         start = 0
-        for source, (_, *sizes) in zip(self._seen, self.layout.images, strict=True):
+        for source, (_, *sizes) in zip(self._sources, self.layout.images, strict=True):
             dim = (self.layout.worlds, math.prod(sizes))
             wp.launch(
                 _keep_image, dim, inputs=[source, start, self._counter], outputs=[self._images], device=self.device
@@ -178,13 +179,11 @@ class TapReader:
 
     def __init__(self, tap: Tap) -> None:
         self._tap = tap
-        self._cuda = tap.device.startswith("cuda")
-        self._stream = torch.cuda.Stream(tap.device) if self._cuda else None
-        self._values = torch.empty(tap.values.shape, dtype=torch.float32, pin_memory=self._cuda)
-        self._marks = torch.empty(tap.marks.shape, dtype=torch.int32, pin_memory=self._cuda)
-        self._images = torch.empty(tap.images.shape, dtype=torch.uint8, pin_memory=self._cuda)
-        self._pairs = (self._values, tap.values), (self._marks, tap.marks), (self._images, tap.images)
-        self._counts = torch.zeros(2, dtype=torch.int64, pin_memory=self._cuda)
+        cuda = tap.device.startswith("cuda")
+        self._stream = torch.cuda.Stream(tap.device) if cuda else None
+        sources = (tap.values, tap.marks, tap.images)
+        self._pairs = [(torch.empty(each.shape, dtype=each.dtype, pin_memory=cuda), each) for each in sources]
+        self._counts = torch.zeros(2, dtype=torch.int64, pin_memory=cuda)
         self.next = 0
         """Number of the step that is read next."""
 
@@ -193,16 +192,14 @@ class TapReader:
         the device overwrote meanwhile."""
         size, started = self._tap.layout.rows, self.next
         self._on_stream(lambda: self._counts[0:1].copy_(self._tap.count, non_blocking=True))
-        there = int(self._counts[0])
-        first = max(started, there - size + 1, there - (most or size))
-        self._on_stream(lambda: self._copy(first, there))
+        end = int(self._counts[0])
+        first = max(started, end - size + 1, end - (most or size))
+        self._on_stream(lambda: self._copy(first, end))
         # of what was copied, the device may have written over the oldest rows, and be at work on one more
-        first = min(there, max(first, int(self._counts[1]) - size + 1))
-        self.next = there
-        places = np.arange(first, there) % size
-        values, marks = self._values.numpy()[places], self._marks.numpy()[places]
-        images = self._images.numpy()[places] if self._tap.layout.images else None
-        return Rows(self._tap.layout, first, values, marks, first - started, images)
+        first = min(end, max(first, int(self._counts[1]) - size + 1))
+        self.next = end
+        places = np.arange(first, end) % size
+        return Rows(self._tap.layout, first, *(copy.numpy()[places] for copy, _ in self._pairs), first - started)
 
     def _copy(self, first: int, end: int) -> None:
         size = self._tap.layout.rows
