@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -17,14 +16,6 @@ VELOCITIES = frozenset({"velocity_command", "moving_velocity_command", "heading_
 """Commands of Muster's library that are velocities forward, to the left [m/s] and turning left [rad/s]: a ``geometry_msgs/Twist``."""
 _JOINT_POSITIONS = ("joint_position", "measured_joint_position")
 _JOINT_OFFSETS = ("joint_offset", "measured_joint_offset")
-
-
-@dataclass(frozen=True)
-class _Read:
-    """A term and the reader of its quantity."""
-
-    term: Term
-    read: Reader
 
 
 class Observations:
@@ -58,7 +49,7 @@ class Observations:
         self.images = {group.name: group for group in contract.groups if group.image is not None}
         self._problems: list[str] = []
         self.unit = self._find_unit()
-        self._terms = {group.name: [self._reader(term) for term in group.terms] for group in contract.groups}
+        self._readers = {group.name: [self._reader(term) for term in group.terms] for group in contract.groups}
         for group in contract.groups:
             self._check_group(group)
         if self._problems:
@@ -82,13 +73,13 @@ class Observations:
             if group.image is not None:
                 found[group.input] = self._stacked(group, snapshot)
             else:
-                parts = [self._term(group.name, each, snapshot) for each in self._terms[group.name]]
+                pairs = zip(group.terms, self._readers[group.name], strict=True)
+                parts = [self._numbers(group.name, term, read(snapshot)) for term, read in pairs]
                 found[group.input] = np.concatenate(parts)[None]
         return found
 
-    def _term(self, group: str, each: _Read, snapshot: Snapshot) -> np.ndarray:
-        term = each.term
-        value: np.ndarray = np.atleast_1d(np.asarray(each.read(snapshot), dtype=np.float32)) - term.offset
+    def _numbers(self, group: str, term: Term, quantity: np.ndarray | float) -> np.ndarray:
+        value: np.ndarray = np.atleast_1d(np.asarray(quantity, dtype=np.float32)) - term.offset
         if term.clip is not None:
             value = np.clip(value, *term.clip)
         value = value * term.scale
@@ -103,22 +94,20 @@ class Observations:
     def _stacked(self, group: Group, snapshot: Snapshot) -> np.ndarray:
         assert group.image is not None
         image, past = snapshot.images[group.name], self._past.get(group.name)
-        if past is None:
-            past = np.tile(image, (group.image.frames, 1, 1))
-        else:
-            past = np.concatenate([image, past[: -len(image)]])
+        past = (
+            np.tile(image, (group.image.frames, 1, 1)) if past is None else np.concatenate([image, past[: -len(image)]])
+        )
         self._past[group.name] = past
         return past[None]
 
     def _find_unit(self) -> Frame | None:
         found: dict[tuple[str, str], Frame] = {}
-        for group in self._contract.groups:
-            for term in group.terms:
-                if term.library and term.quantity in OF_UNIT and term.frame is not None:
-                    found[term.frame.body, term.frame.name] = term.frame
+        for term in (term for group in self._contract.groups for term in group.terms):
+            if term.library and term.quantity in OF_UNIT and term.frame is not None:
+                found[term.frame.body, term.frame.name] = term.frame
         if len(found) > 1:
-            there = ", ".join(f"{name} on {body}" for body, name in found)
-            self._problems.append(f"it has several inertial measurement units ({there}), the node reads one")
+            units = ", ".join(f"{name} on {body}" for body, name in found)
+            self._problems.append(f"it has several inertial measurement units ({units}), the node reads one")
         return next(iter(found.values()), None)
 
     def _check_group(self, group: Group) -> None:
@@ -133,12 +122,12 @@ class Observations:
             f"the images of {group.name} have the channels {', '.join(image.channels)}, the node reads red, green, blue or grey"
         )
 
-    def _reader(self, term: Term) -> _Read:
+    def _reader(self, term: Term) -> Reader:
         try:
-            return _Read(term, self._measured(term))
+            return self._measured(term)
         except Refused as problem:
             self._problems.append(f"{term.name}: {problem}")
-            return _Read(term, lambda snapshot: np.zeros(len(term.names), np.float32))
+            return lambda snapshot: 0.0
 
     def _measured(self, term: Term) -> Reader:
         """The reader of a term's quantity. Raises Refused with the missing input."""
@@ -216,25 +205,9 @@ class Observations:
         raise Refused(f"{term.quantity} is none of the actions that the node keeps")
 
 
-class Drawn(Protocol):
-    """A command, by the function that draws it in training."""
-
-    @property
-    def quantity(self) -> str: ...
-    @property
-    def library(self) -> bool: ...
-
-
-def is_twist(command: Drawn) -> bool:
-    """Whether a command comes as a ``geometry_msgs/Twist``; else as a ``std_msgs/Float64MultiArray``."""
-    return command.library and command.quantity in VELOCITIES
-
-
-def needed_topics(found: Observations) -> Mapping[str, str]:
-    """Topics of the node's inputs, and the purpose of each."""
-    topics = {name: "measured" for name in (JOINTS, IMU, ODOMETRY) if name in found.needs}
-    topics |= {command_topic(command): f"command {name}" for name, command in found.commands.items()}
-    return topics | {image_topic(name): f"image {name}" for name in found.images}
+def is_twist(command: Any) -> bool:
+    """Whether a command of the contract comes as a ``geometry_msgs/Twist``; else as a ``std_msgs/Float64MultiArray``."""
+    return bool(command.library) and command.quantity in VELOCITIES
 
 
 def command_topic(command: Command) -> str:

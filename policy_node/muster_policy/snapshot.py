@@ -109,8 +109,8 @@ def place_of(frame: Frame | None, unit: Frame | None) -> Place:
         frame: Of the quantity, on the root's body; None: the root's own.
         unit: Of the inertial measurement unit, on the root's body; None: the root's own.
     """
-    arm = np.zeros(3) if frame is None else frame.position
-    turns = [np.eye(3) if each is None else matrix(each.rotation) for each in (frame, unit)]
+    arm = np.zeros(3) if frame is None else np.array(frame.position)
+    turns = [np.eye(3) if each is None else matrix(np.array(each.rotation)) for each in (frame, unit)]
     return Place(arm, *turns)
 
 
@@ -137,19 +137,14 @@ def _gravity(snapshot: Snapshot, place: Place) -> np.ndarray:
     return found
 
 
-def _orientation(snapshot: Snapshot, place: Place) -> np.ndarray:
-    turn = _odometry(snapshot).rotation
-    return -turn if turn[3] < 0.0 else turn
+def _in_world(snapshot: Snapshot, place: Place) -> np.ndarray:
+    found: np.ndarray = matrix(_odometry(snapshot).rotation) @ _velocity(snapshot, place)
+    return found
 
 
 def _heading(snapshot: Snapshot, place: Place) -> float:
     forward = matrix(_odometry(snapshot).rotation)[:, 0]
     return float(np.arctan2(forward[1], forward[0]))
-
-
-def _in_world(snapshot: Snapshot, place: Place) -> np.ndarray:
-    found: np.ndarray = matrix(_odometry(snapshot).rotation) @ _velocity(snapshot, place)
-    return found
 
 
 FROM_IMU: Mapping[str, Quantity] = {
@@ -169,7 +164,9 @@ FROM_ODOMETRY: Mapping[str, Quantity] = {
     "root_com_linear_velocity_in_world": _in_world,
     "root_position": lambda snapshot, place: _odometry(snapshot).position,
     "root_height": lambda snapshot, place: float(_odometry(snapshot).position[2]),
-    "root_orientation": _orientation,
+    "root_orientation": lambda snapshot, place: (
+        (-1.0 if (turn := _odometry(snapshot).rotation)[3] < 0.0 else 1.0) * turn
+    ),
     "heading": _heading,
 }
 """Quantities from a ``nav_msgs/Odometry`` of the root's frame."""
