@@ -50,6 +50,8 @@ if TYPE_CHECKING:
 
 COPIED = ("iteration", "reward", "score", "score_error", "score_episodes", "env_steps", "algorithm")
 """Keys that a bundle's manifest repeats from its checkpoint's."""
+PACKAGES = ("torch", "onnx", "onnxruntime", "newton", "warp-lang", "rsl-rl-lib")
+"""Whose versions the manifest has."""
 
 
 @dataclass(frozen=True)
@@ -90,34 +92,27 @@ def bundle_files(
     compared = {**recordings, "made_up": parity.made_up(exported)}
     for recording in compared.values():
         if len(recording.begins) > 1:
-            first = parity.RecordedObservations(
-                {name: each[: parity.STEPS] for name, each in recording.inputs.items()},
-                recording.begins[: parity.STEPS],
-            )
-            parity.refuse_hidden_memory(policy, exported, algorithm, first, groups)
+            first = {name: each[: parity.STEPS] for name, each in recording.inputs.items()}
+            start = parity.RecordedObservations(first, recording.begins[: parity.STEPS])
+            parity.refuse_hidden_memory(policy, exported, algorithm, start, groups)
     onnx, torchscript = to_onnx(exported, metadata_of(contract, run_path)), to_torchscript(exported)
-    models: dict[str, parity.Runnable] = {
-        "onnx": OnnxPolicy(onnx, contract),
-        "torchscript": ScriptPolicy(torchscript, contract),
-    }
-    found: dict[str, float] = dict.fromkeys(models, 0.0)
+    models = {"onnx": OnnxPolicy(onnx, contract), "torchscript": ScriptPolicy(torchscript, contract)}
+    found = dict.fromkeys(models, 0.0)
     arrays: dict[str, np.ndarray] = {}
     for name, recording in compared.items():
-        wanted = parity.trained_actions(policy, recording, groups)
+        actions = parity.trained_actions(policy, recording, groups)
         for kind, model in models.items():
-            found[kind] = max(found[kind], parity.compare(kind, model, recording, wanted))
+            found[kind] = max(found[kind], parity.compare(kind, model, recording, actions))
         if name == "rollout":
-            arrays |= {**recording.inputs, "begins": recording.begins, "actions": wanted}
+            arrays |= {**recording.inputs, "begins": recording.begins, "actions": actions}
         elif name == "extremes":
             arrays |= {f"extreme_{key}": each[0] for key, each in recording.inputs.items()}
-            arrays["extreme_actions"] = wanted[0]
-    counts = {name: recording.count for name, recording in compared.items()}
-    resets = {name: recording.resets for name, recording in compared.items() if name == "rollout"}
+            arrays["extreme_actions"] = actions[0]
     report = {
         "tolerance": parity.TOLERANCE,
         "greatest_difference": found,
-        "observations": counts,
-        "resets": resets.get("rollout", 0),
+        "observations": {name: recording.count for name, recording in compared.items()},
+        "resets": compared["rollout"].resets if "rollout" in compared else 0,
     }
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
@@ -154,8 +149,8 @@ def export(
     exported = policy.module()
     groups = {group.input: group.name for group in contract.groups}
     begin = task.state_dict()
-    extremes = rollouts.Extremes(groups) if all(len(group.shape) == 1 for group in contract.groups) else None
-    trained = rollouts.play(task, acting, rounds, extremes) if rounds else None
+    extremes = rollouts.Extremes(acting, groups) if all(len(group.shape) == 1 for group in contract.groups) else None
+    trained = rollouts.play(task, extremes or acting, rounds) if rounds else None
     recordings = {"rollout": rollouts.record(task, acting, groups)}
     if extremes and rounds:
         recordings["extremes"] = parity.single(extremes.inputs())
@@ -165,10 +160,8 @@ def export(
     if trained:
         task.load_state_dict(begin)  # the same worlds, and the same random numbers from there on
         played = rollouts.play(task, OnnxPolicy(files.onnx, contract), rounds)
-        report["judged"] = {
-            "runtime": f"onnxruntime {metadata.version('onnxruntime')}",
-            **rollouts.judge(trained, played),
-        }
+        runtime = f"onnxruntime {metadata.version('onnxruntime')}"
+        report["judged"] = {"runtime": runtime, **rollouts.judge(trained, played)}
     return _publish(run, checkpoint, task, contract, files, documents, {**report, "changed_robot": changes or None})
 
 
@@ -196,6 +189,9 @@ def _publish(
         for name, document in documents.items():
             write_json(hidden / name, document)
         (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot, list(documents)))
+        source = inspect.getsourcefile(type(task))
+        digest = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
+        versions = {"muster": __version__, "python": platform.python_version()}
         seal(
             hidden,
             {
@@ -209,8 +205,8 @@ def _publish(
                 "parent": (run.description() or {}).get("parent"),
                 "robot": robot,
                 "opset": OPSET,
-                "code": _code(type(task)),
-                "versions": _versions(),
+                "code": {"module": type(task).__module__, "sha256": digest},
+                "versions": {**versions, **{name: metadata.version(name) for name in PACKAGES}},
                 "created": time.time(),
             },
         )
@@ -222,20 +218,6 @@ def _publish(
                 return target
     finally:
         shutil.rmtree(hidden, ignore_errors=True)
-
-
-def _code(task: type) -> dict[str, str]:
-    """The module of the task, and the SHA-256 of its source as it was when the bundle was made."""
-    source = inspect.getsourcefile(task)
-    digest = hashlib.sha256(Path(source).read_bytes()).hexdigest() if source else ""
-    return {"module": task.__module__, "sha256": digest}
-
-
-def _versions() -> dict[str, str]:
-    packages = ("torch", "onnx", "onnxruntime", "newton", "warp-lang", "rsl-rl-lib")
-    return {"muster": __version__, "python": platform.python_version()} | {
-        name: metadata.version(name) for name in packages
-    }
 
 
 def _readme(

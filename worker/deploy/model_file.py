@@ -90,9 +90,8 @@ class OnnxPolicy:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = (
-            1  # faster for small networks, and the same each time
-        )
+        # faster for small networks, and the same each time
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         source = model if isinstance(model, bytes) else str(model)
         self._session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
@@ -109,14 +108,16 @@ class OnnxPolicy:
         """Actions for the inputs by name, each of shape (n, …); shape (n, actions)."""
         if not self._states:
             count = len(next(iter(inputs.values())))
-            self._states = {
-                state.name: np.zeros((count, *state.shape), dtype=np.float32) for state in self._contract.states
-            }
-        outputs = ["actions", *(state.output for state in self._contract.states)]
-        actions, *states = self._session.run(outputs, {**inputs, **self._states})
+            self._states = {state.name: np.zeros((count, *state.shape), np.float32) for state in self._contract.states}
+        actions, *states = self._outputs({**inputs, **self._states})
         self._states = dict(zip(self._states, states, strict=True))
-        found: np.ndarray = actions
-        return found
+        return actions
+
+    def _outputs(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Actions and next states."""
+        names = ["actions", *(state.output for state in self._contract.states)]
+        outputs: list[np.ndarray] = self._session.run(names, dict(inputs))
+        return outputs
 
     def reset(self, worlds: torch.Tensor | np.ndarray | None = None) -> None:
         """Forget the recurrent state of all worlds, or where ``worlds``, shape (n,), bool, is true."""
@@ -138,16 +139,7 @@ class ScriptPolicy(OnnxPolicy):
         self._states = {}
 
     @torch.no_grad()
-    def run(self, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
-        """See :meth:`OnnxPolicy.run`."""
-        count = len(next(iter(inputs.values())))
-        if not self._states:
-            self._states = {
-                state.name: np.zeros((count, *state.shape), dtype=np.float32) for state in self._contract.states
-            }
-        given = [*(inputs[group.input] for group in self._contract.groups), *self._states.values()]
-        outputs = self._module(*(torch.from_numpy(each) for each in given))
-        actions, *states = outputs if isinstance(outputs, tuple) else (outputs,)
-        self._states = {name: state.numpy().copy() for name, state in zip(self._states, states, strict=True)}
-        found: np.ndarray = actions.numpy()
-        return found
+    def _outputs(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        names = [*(group.input for group in self._contract.groups), *self._states]
+        outputs = self._module(*(torch.from_numpy(inputs[name]) for name in names))
+        return [each.numpy().copy() for each in (outputs if isinstance(outputs, tuple) else (outputs,))]

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,20 +13,13 @@ from tensordict import TensorDict
 from worker.settings.errors import TrainingError, UserError
 
 if TYPE_CHECKING:
+    from worker.deploy.model_file import OnnxPolicy
     from worker.learning.algorithm import ExportedPolicy, Policy
 
 TOLERANCE = 1e-5
 """Greatest difference of an action, absolute up to 1 and relative beyond."""
 STEPS = 3
 """Steps on made-up observations: a single step would not show a policy's memory."""
-
-
-class Runnable(Protocol):
-    """A policy from a file."""
-
-    def run(self, inputs: Mapping[str, np.ndarray]) -> np.ndarray: ...
-
-    def reset(self, worlds: Any = None) -> None: ...
 
 
 @dataclass(frozen=True)
@@ -72,35 +65,35 @@ def trained_actions(policy: Policy, recording: RecordedObservations, groups: Map
         recording: What it sees.
         groups: The observation group of each input.
     """
+
+    def act(inputs: Mapping[str, np.ndarray]) -> np.ndarray:
+        seen = {groups[name]: torch.from_numpy(each.copy()) for name, each in inputs.items()}
+        return policy.act(TensorDict(seen, batch_size=[recording.begins.shape[1]])).numpy().copy()
+
+    return _actions(policy, recording, act)
+
+
+def _actions(
+    policy: Any, recording: RecordedObservations, act: Callable[[Mapping[str, np.ndarray]], np.ndarray]
+) -> np.ndarray:
+    """What ``act`` returns in each step, between resets of the policy; shape (steps, worlds, actions)."""
     actions = []
     policy.reset()
     for step, begins in enumerate(recording.begins):
         if step and begins.any():
             policy.reset(torch.from_numpy(begins))
-        seen = {groups[name]: torch.from_numpy(each[step].copy()) for name, each in recording.inputs.items()}
-        actions.append(policy.act(TensorDict(seen, batch_size=[len(begins)])).numpy().copy())
+        actions.append(act({name: np.ascontiguousarray(each[step]) for name, each in recording.inputs.items()}))
     return np.stack(actions)
 
 
-def exported_actions(policy: Runnable, recording: RecordedObservations) -> np.ndarray:
-    """Actions of the exported policy; shape (steps, worlds, actions)."""
-    actions = []
-    policy.reset()
-    for step, begins in enumerate(recording.begins):
-        if step and begins.any():
-            policy.reset(begins)
-        actions.append(policy.run({name: np.ascontiguousarray(each[step]) for name, each in recording.inputs.items()}))
-    return np.stack(actions)
-
-
-def difference(found: np.ndarray, wanted: np.ndarray) -> float:
+def difference(found: np.ndarray, expected: np.ndarray) -> float:
     """The greatest difference of two arrays of actions: absolute up to 1, relative beyond. NaN where one is not a number."""
-    return float((np.abs(found - wanted) / np.maximum(1.0, np.abs(wanted))).max())
+    return float((np.abs(found - expected) / np.maximum(1.0, np.abs(expected))).max())
 
 
-def compare(what: str, policy: Runnable, recording: RecordedObservations, wanted: np.ndarray) -> float:
+def compare(what: str, policy: OnnxPolicy, recording: RecordedObservations, trained: np.ndarray) -> float:
     """The greatest difference of an exported policy to the trained one's actions. Raises TrainingError above the tolerance."""
-    found = difference(exported_actions(policy, recording), wanted)
+    found = difference(_actions(policy, recording, policy.run), trained)
     if not found <= TOLERANCE:
         raise TrainingError(
             f"the exported policy ({what}) differs from the trained one by {found:g} (at most {TOLERANCE:g} is allowed); not published"

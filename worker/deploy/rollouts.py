@@ -29,32 +29,36 @@ SHARE, ERRORS = 0.01, 2.0
 
 
 class Extremes:
-    """The observations in which some number was the least or the greatest that was seen.
+    """A policy, and the observations in which some number was the least or the greatest that it has seen.
 
     Args:
+        policy: On the task's device.
         groups: The observation group of each input of the policy.
     """
 
-    def __init__(self, groups: Mapping[str, str]) -> None:
-        self._groups = groups
+    def __init__(self, policy: Acting, groups: Mapping[str, str]) -> None:
+        self._policy, self._groups = policy, groups
         self._best: dict[tuple[str, bool], torch.Tensor] = {}
         self._rows: dict[tuple[str, bool], dict[str, torch.Tensor]] = {}
 
-    def look(self, observations: TensorDict) -> None:
-        """Take in one step."""
-        for name, group in self._groups.items():
-            for greatest in (False, True):
-                numbers = observations[group] if greatest else -observations[group]
-                values, worlds = numbers.max(dim=0)
-                rows = {each: observations[there][worlds] for each, there in self._groups.items()}
-                key = name, greatest
-                if key not in self._best:
-                    self._best[key], self._rows[key] = values.clone(), rows
-                    continue
-                better = values > self._best[key]
-                self._best[key][better] = values[better]
-                for each, kept in self._rows[key].items():
-                    kept[better] = rows[each][better]
+    def act(self, observations: TensorDict) -> torch.Tensor:
+        """The policy's actions for observations, which are taken in."""
+        for key in ((name, greatest) for name in self._groups for greatest in (False, True)):
+            numbers = observations[self._groups[key[0]]]
+            values, worlds = (numbers if key[1] else -numbers).max(dim=0)
+            rows = {name: observations[group][worlds] for name, group in self._groups.items()}
+            if key not in self._best:
+                self._best[key], self._rows[key] = values.clone(), rows
+                continue
+            better = values > self._best[key]
+            self._best[key][better] = values[better]
+            for name, kept in self._rows[key].items():
+                kept[better] = rows[name][better]
+        return self._policy.act(observations)
+
+    def reset(self, worlds: torch.Tensor | None = None) -> None:
+        """As that of the policy."""
+        self._policy.reset(worlds)
 
     def inputs(self) -> dict[str, np.ndarray]:
         """By name of the input, shape (n, …), each observation once."""
@@ -62,20 +66,6 @@ class Extremes:
         flat = torch.cat([each.flatten(1) for each in joined.values()], dim=1).numpy()
         _, first = np.unique(flat, axis=0, return_index=True)
         return {name: each.numpy()[np.sort(first)] for name, each in joined.items()}
-
-
-class _Watched:
-    """A policy whose observations are taken in before it acts."""
-
-    def __init__(self, policy: Acting, extremes: Extremes) -> None:
-        self._policy, self._extremes = policy, extremes
-
-    def act(self, observations: TensorDict) -> torch.Tensor:
-        self._extremes.look(observations)
-        return self._policy.act(observations)
-
-    def reset(self, worlds: torch.Tensor | None = None) -> None:
-        self._policy.reset(worlds)
 
 
 def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> RecordedObservations:
@@ -107,17 +97,9 @@ def record(task: Task, policy: Acting, groups: Mapping[str, str]) -> RecordedObs
     return RecordedObservations({name: np.stack(rows) for name, rows in kept.items()}, begins)
 
 
-def play(task: Task, policy: Acting, rounds: int, extremes: Extremes | None = None) -> Episodes:
-    """Whole episodes from a fresh reset, ``rounds`` of each world, without noise, as an evaluation plays them.
-
-    Args:
-        task: The worlds.
-        policy: On the task's device.
-        rounds: At least 1.
-        extremes: Is shown every observation.
-    """
-    alone = Gang(RankPlacement(), task.device, None, ["here"])
-    return episodes.play([task] * rounds, _Watched(policy, extremes) if extremes else policy, alone)
+def play(task: Task, policy: Acting, rounds: int) -> Episodes:
+    """Whole episodes from a fresh reset, ``rounds`` of each world, at least 1, without noise, as an evaluation plays them."""
+    return episodes.play([task] * rounds, policy, Gang(RankPlacement(), task.device, None, ["here"]))
 
 
 def judge(trained: Episodes, bundle: Episodes) -> dict[str, Any]:
