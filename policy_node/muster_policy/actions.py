@@ -44,9 +44,9 @@ class Commands:
 
     def __init__(self, contract: Contract, names: Mapping[str, str] | None = None, strict: bool = False) -> None:
         if not contract.actions:
-            names = ", ".join(contract.action_names[:5])
+            labels = ", ".join(contract.action_names[:5])
             raise Refused(
-                f"task {contract.task} can't drive joints: the policy does not say what its actions are: {names}"
+                f"task {contract.task} can't drive joints: the policy does not say what its actions are: {labels}"
             )
         self._choices = _choices(contract) if contract.discrete else None
         if ruled := [action for action in contract.actions if action.rule]:

@@ -187,15 +187,15 @@ def _part(kind: Any, found: Any) -> Any:
     Raises KeyError, TypeError, ValueError, AttributeError.
     """
     parts = get_args(kind)
-    if is_dataclass(kind):
+    if isinstance(kind, type) and is_dataclass(kind):
         types = get_type_hints(kind)
-        needed = [each.name for each in fields(kind) if each.name in found or each.default is MISSING]
-        return kind(**{name: _part(types[name], found[name]) for name in needed})
+        names = [each.name for each in fields(kind) if each.name in found or each.default is MISSING]
+        return kind(**{name: _part(types[name], found[name]) for name in names})
     if get_origin(kind) is UnionType:
         return None if found is None else _part(parts[0], found)
     if get_origin(kind) is tuple:
-        types = [parts[0]] * len(found) if parts[-1] is ... else parts
-        return tuple(_part(each, value) for each, value in zip(types, found, strict=True))
+        kinds = [parts[0]] * len(found) if parts[-1] is ... else parts
+        return tuple(_part(each, value) for each, value in zip(kinds, found, strict=True))
     if kind is np.ndarray:
         return np.asarray(found, dtype=np.float32)
     return kind(found) if kind in (int, float, bool) else found

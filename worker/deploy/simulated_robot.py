@@ -136,10 +136,10 @@ class SimulatedRobot:
 
         found: list[Message] = []
         described: dict[str, Any] = {command.name: command for command in self.contract.commands}
-        memory = self.task.state_tensors()["memory"][0].double()
         for each in self.task.plan.commands:
             command = described[each.bound.name]
-            numbers = memory[each.first : each.first + len(command.names)].tolist()
+            memory = self.task.state_tensors()["memory"][0, each.first : each.first + len(command.names)]
+            numbers = memory.double().tolist()
             if is_twist(command):
                 twist = self.messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))
                 found.append((command_topic(command), "geometry_msgs/msg/Twist", twist))

@@ -26,6 +26,7 @@ from shared_store.volume.logs import OUTCOME_LINE, format_line, format_lines
 from shared_store.volume.node_outcomes import EX_TEMPFAIL, Outcome
 from worker.node import supervisor
 from worker.node.lifeline import ChildEnd, Loss, MainEnd
+from worker.node.network import address_towards
 
 _PEER_GRACE = 5.0
 """Seconds that the main node's ranks get after a child died: their collectives are broken, there is nothing to save."""
@@ -83,7 +84,7 @@ def complete(env: Mapping[str, str]) -> tuple[NodeContract, dict[str, str]]:
         ContractError: A variable is missing or malformed; the message names it.
     """
     try:
-        told = json.loads(env["MUSTER_NODE"])
+        shared = json.loads(env["MUSTER_NODE"])["contract"]
         variables = json.loads(env.get("MUSTER_ENVIRONMENT", "{}"))
         index, count, main = (int(env[name]) for name in _NODE_VARIABLES)
         address = own_address(env)
@@ -93,7 +94,7 @@ def complete(env: Mapping[str, str]) -> tuple[NodeContract, dict[str, str]]:
             main_index=main,
             master_address=env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") or address,
             address=address,
-            **{**told["contract"], "array": tuple(told["contract"]["array"]) if told["contract"]["array"] else None},
+            **{**shared, "array": tuple(shared["array"]) if shared["array"] else None},
         )
     except KeyError as error:
         raise ContractError(f"{error.args[0]} is missing; a node on AWS Batch is started by Muster's engine") from None
@@ -120,12 +121,10 @@ def own_address(env: Mapping[str, str]) -> str:
             urllib.request.urlopen(uri, timeout=5) as answer,
         ):
             return str(json.load(answer)["Networks"][0]["IPv4Addresses"][0])
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.connect(("192.0.2.1", 9))  # sends nothing: it only asks the kernel for the route
-            return str(probe.getsockname()[0])
-        except OSError:
-            return socket.gethostbyname(socket.gethostname())
+    try:
+        return address_towards("192.0.2.1")
+    except OSError:
+        return socket.gethostbyname(socket.gethostname())
 
 
 def take_run(contract: NodeContract, description: Mapping[str, object], line: MainEnd | ChildEnd | None) -> None:
@@ -144,9 +143,8 @@ def take_run(contract: NodeContract, description: Mapping[str, object], line: Ma
         if read_epoch(run) < contract.epoch:
             raise_epoch(run, contract.epoch, Claim("", contract.job, contract.attempt))
         elif (held := read_claim(run, contract.epoch)) and (held.job, held.attempt) != (contract.job, contract.attempt):
-            raise StaleEpoch(
-                f"run {run.name}: attempt {held.attempt} of job {held.job} has epoch {contract.epoch} already"
-            )
+            holder = f"attempt {held.attempt} of job {held.job}"
+            raise StaleEpoch(f"run {run.name}: {holder} has epoch {contract.epoch} already")
         return
     deadline = time.monotonic() + _PATIENCE
     taken = attached = False

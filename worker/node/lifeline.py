@@ -18,8 +18,8 @@ from shared_store.volume.node_outcomes import EX_TEMPFAIL
 
 PORT = 29499
 """Port of the main node, one below torch.distributed's."""
-_IDLE, _INTERVAL, _PROBES = 5, 5, 3
-"""Keepalive: a host that is gone is noticed after ``_IDLE + _INTERVAL * _PROBES`` seconds."""
+_KEEPALIVE = {socket.TCP_KEEPIDLE: 5, socket.TCP_KEEPINTVL: 5, socket.TCP_KEEPCNT: 3}
+"""A host that is gone is noticed after 5 + 5 * 3 seconds."""
 _WORDS = {"gang": str, "node": int, "code": int, "reason": str}
 """The bytes that a child sends; others come from a stranger."""
 _ARRIVAL = 1800.0
@@ -49,32 +49,28 @@ class MainEnd:
 
     def lost(self) -> Loss | None:
         """The first child that was found to have failed since the last call; None while all is well."""
-        while True:
-            try:
+        with contextlib.suppress(OSError):
+            while True:
                 connection, _ = self._server.accept()
-            except OSError:
-                break
-            self._lines.append(_Line(connection))
+                self._lines.append(_Line(connection))
         found = None
         for line in list(self._lines):
-            there = line.read()
-            ours = line.told.get("gang") == self._gang and "node" in line.told
-            if ours:
-                self._missing.discard(line.told["node"])
-            if not there:
-                self._lines.remove(line)
-                if ours and found is None:
-                    found = _loss(line.told)
+            is_connected = line.read()
+            node = line.words.get("node") if line.words.get("gang") == self._gang else None
+            self._missing.discard(node)
+            if is_connected:
+                continue
+            self._lines.remove(line)
+            code = line.words.get("code")
+            if node is None or found is not None or code in (0, EX_TEMPFAIL):
+                continue
+            if code is None:
+                found = Loss(f"node {node} vanished: its supervisor or its host died", 1)
+            else:
+                found = Loss(f"node {node}: {line.words.get('reason', '')}", code)
         if found is None and self._missing and time.monotonic() > self._deadline:
             found = Loss(f"node {min(self._missing)} has not come within {_ARRIVAL:.0f} s of the main node", 1)
         return found
-
-
-def _loss(told: dict[str, Any]) -> Loss | None:
-    code = told.get("code")
-    if code is None:
-        return Loss(f"node {told['node']} vanished: its supervisor or its host died", 1)
-    return Loss(f"node {told['node']}: {told.get('reason', '')}", code) if code not in (0, EX_TEMPFAIL) else None
 
 
 class _Line:
@@ -82,12 +78,11 @@ class _Line:
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection, self._partial = connection, b""
-        self.told: dict[str, Any] = {}
+        self.words: dict[str, Any] = {}
         connection.setblocking(False)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, _IDLE)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, _INTERVAL)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, _PROBES)
+        for option, value in _KEEPALIVE.items():
+            connection.setsockopt(socket.IPPROTO_TCP, option, value)
 
     def read(self) -> bool:
         """Take in what came; False once the line is cut."""
@@ -98,7 +93,7 @@ class _Line:
                     with contextlib.suppress(ValueError, RecursionError):  # a stranger
                         words = json.loads(line)
                         if isinstance(words, dict) and all(type(words[key]) is _WORDS.get(key) for key in words):
-                            self.told |= words
+                            self.words |= words
         except BlockingIOError:
             return True
         except OSError:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import fcntl
 import ipaddress
 import socket
-import struct
 
-_SIOCGIFADDR = 0x8915
+import psutil
 
 
 def interface_of(address: str | None, peer: str) -> str | None:
@@ -18,22 +16,12 @@ def interface_of(address: str | None, peer: str) -> str | None:
         return None
     if found.is_loopback:
         return "lo"  # the whole of 127.0.0.0/8 is on it
-    for _, name in socket.if_nameindex():
-        if _address_on(name) == str(found):
-            return name
-    return None
+    interfaces = psutil.net_if_addrs().items()
+    return next((name for name, held in interfaces if any(each.address == str(found) for each in held)), None)
 
 
 def address_towards(peer: str) -> str:
+    """This node's IPv4 address on the route to ``peer``. Raises OSError."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.connect((peer, 9))  # sends nothing: it only asks the kernel for the route
         return str(probe.getsockname()[0])
-
-
-def _address_on(interface: str) -> str | None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            reply = fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, struct.pack("256s", interface.encode()[:15]))
-        except OSError:
-            return None
-    return socket.inet_ntoa(reply[20:24])

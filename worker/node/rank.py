@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import errno
 import os
 import shutil
@@ -19,6 +21,7 @@ from shared_store.process.tether import tied
 from shared_store.volume.files import DamagedFile, json_object, read_json
 from shared_store.volume.node_outcomes import FirstError
 
+_PR_SET_CHILD_SUBREAPER = 36
 _LONGEST_LINE = 65536
 """Bytes after which a line without an end is cut, so that a program that never prints a newline can't fill the memory."""
 _LONGEST_MESSAGE = 65536
@@ -53,7 +56,7 @@ class Rank:
         self.stalled: str | None = None
         """Its stacks when it had made no progress for too long."""
         self.progress: dict[str, Any] = {}
-        """The newest of everything that it told (:mod:`worker.learning.beacon`)."""
+        """The newest of everything that it reported (:mod:`worker.learning.beacon`)."""
         self.heard: float | None = None
         """Time of its last message about an iteration (monotonic [s]); None before the first and after the last iteration."""
         self.spoke = time.monotonic()
@@ -139,7 +142,10 @@ class Rank:
         self.running, self.ended = False, time.time()
         self.exit_code = code if code >= 0 else 128 - code
         if code < 0:
-            self.signal_name = _signal_name(-code)
+            try:
+                self.signal_name = signal.Signals(-code).name
+            except ValueError:  # a real-time signal
+                self.signal_name = f"signal {-code}"
         return True
 
     def give_up(self, stuck: str) -> None:
@@ -174,7 +180,7 @@ class Rank:
         *lines, self._beacon = (self._beacon + chunk).split(b"\n")
         if len(self._beacon) > _LONGEST_MESSAGE:
             self._beacon = _TOO_LONG
-        said = []
+        reports = []
         self.spoke = time.monotonic()
         for line in lines:
             if line.startswith(_TOO_LONG) or len(line) > _LONGEST_MESSAGE:
@@ -191,17 +197,14 @@ class Rank:
             if message.get("done"):
                 self.heard = None
             if "said" in message:
-                said.append(str(message.pop("said"))[:_LONGEST_VALUE])
-            self._note(message)
-        return said
-
-    def _note(self, message: dict[str, Any]) -> None:
-        for name, value in message.items():
-            known = name in self.progress or (len(self.progress) < _MOST_VALUES and len(name) <= _LONGEST_VALUE)
-            if known and isinstance(value, str):
-                self.progress[name] = value[:_LONGEST_VALUE]
-            elif known and (value is None or (isinstance(value, int | float) and abs(value) < _LARGEST_NUMBER)):
-                self.progress[name] = value
+                reports.append(str(message.pop("said"))[:_LONGEST_VALUE])
+            for name, value in message.items():
+                known = name in self.progress or (len(self.progress) < _MOST_VALUES and len(name) <= _LONGEST_VALUE)
+                if known and isinstance(value, str):
+                    self.progress[name] = value[:_LONGEST_VALUE]
+                elif known and (value is None or (isinstance(value, int | float) and abs(value) < _LARGEST_NUMBER)):
+                    self.progress[name] = value
+        return reports
 
     def rest(self, stream: str) -> str:
         """The output after the last newline."""
@@ -262,8 +265,12 @@ class Rank:
         return FirstError(self.number, last, "", self.ended) if last and self.exit_code else None
 
 
-def _signal_name(number: int) -> str:
-    try:
-        return signal.Signals(number).name
-    except ValueError:  # a real-time signal
-        return f"signal {number}"
+def adopt_orphans() -> None:
+    """Have descendants whose parent dies re-parented to this process instead of to init, so that they can be found (``prctl(2)``)."""
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def kill_group(pid: int, number: int) -> None:
+    """Send signal ``number`` to the process group that ``pid`` leads, where it still exists."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(pid, number)

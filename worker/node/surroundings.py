@@ -1,4 +1,4 @@
-"""The surroundings of a program on a node that is a plain process: variables, directory, user.
+"""The surroundings of a program on a node that is a plain process: variables, directory, user, memory.
 
 A job from YAML has the directory where it was submitted and the machine's variables. One that came through the Batch API was
 written for a container: it starts in an empty directory, which goes with the attempt, with a standard PATH and of the machine's
@@ -17,6 +17,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from shared_store.contract.node import NodeContract, job_variables, rank_variables
+from shared_store.process.memory_groups import killed_for_memory, make_memory_group
 
 _PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 _KEPT = (
@@ -86,3 +87,28 @@ class Surroundings:
         if (setpriv := shutil.which("setpriv")) is None:
             raise FileNotFoundError(errno.ENOENT, "setpriv is not installed, which the job's user needs")
         self.prefix = [setpriv, f"--reuid={uid}", f"--regid={gid}", groups, "--pdeathsig=KILL", "--"]
+
+
+class MemoryLimit:
+    """What the ranks of a node may use together, with all that they start."""
+
+    def __init__(self, contract: NodeContract) -> None:
+        """Make the control group that the contract names, if it names one."""
+        self.problem = ""
+        """Why there is no limit although the contract names one; empty where there is one, or none is wanted."""
+        self.group = contract.memory_group
+        """Directory of the control group that a rank's command enters; empty for no limit."""
+        self._used_up = False
+        if self.group:
+            limit = contract.memory_limit
+            try:
+                make_memory_group(self.group, limit << 20)
+            except OSError as error:
+                self.problem = f"muster: memory is not limited to {limit} MiB: {error.strerror}: {error.filename}"
+                self.group = ""
+
+    def is_used_up(self) -> bool:
+        """Whether the kernel has ended a process of the node for it."""
+        if self.group and not self._used_up:
+            self._used_up = killed_for_memory(self.group)
+        return self._used_up

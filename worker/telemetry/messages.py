@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -140,6 +141,17 @@ def png(image: np.ndarray) -> np.ndarray:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", compress_level=1)
     return np.frombuffer(buffer.getvalue(), np.uint8)
+
+
+def tiled(images: Sequence[np.ndarray], columns: int, gap: int = 0, ground: int = 255) -> np.ndarray:
+    """Images of one size row by row in one, ``gap`` [px] from each other, on a ground of one brightness; uint8."""
+    height, width, *channels = images[0].shape
+    high, wide, rows = height + gap, width + gap, math.ceil(len(images) / columns)
+    whole = np.full((rows * high - gap, columns * wide - gap, *channels), ground, np.uint8)
+    for number, image in enumerate(images):
+        top, left = number // columns * high, number % columns * wide
+        whole[top : top + height, left : left + width] = image
+    return whole
 
 
 def compressed_image(nanoseconds: int, frame: str, image: np.ndarray) -> bytes:

@@ -159,5 +159,5 @@ class Rows:
 
     def of_worlds(self, worlds: int, since: int = 0) -> Rows:
         """Those of the first ``worlds`` worlds, with steps numbered from step ``since``."""
-        parts = (each[:, :worlds] for each in (self.values, self.marks, self.images))
-        return Rows(replace(self.layout, worlds=worlds), self.first - since, *parts, lost=self.lost)
+        values, marks, images = (each[:, :worlds] for each in (self.values, self.marks, self.images))
+        return Rows(replace(self.layout, worlds=worlds), self.first - since, values, marks, images, self.lost)

@@ -20,7 +20,7 @@ os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is s
 import rerun as rr
 import rerun.blueprint as rrb
 
-from worker.telemetry.messages import png
+from worker.telemetry.messages import png, tiled
 
 _ROOT, _MIDDLE = "world", "middle"
 """Frames: of all worlds, and of what the eye follows."""
@@ -129,7 +129,8 @@ class Screen:
         if not len(times):
             return
         columns = rr.EncodedImage.columns(
-            blob=[png(tiled(each)) for each in seen], media_type=["image/png"] * len(seen)
+            blob=[png(tiled(each, math.ceil(math.sqrt(len(each))), ground=0)) for each in seen],
+            media_type=["image/png"] * len(seen),
         )
         self._rr.send_columns(f"images/{camera}", _index(times, steps, iteration), columns)
 
@@ -201,17 +202,6 @@ class Screen:
         half = np.sqrt(0.5)  # times _UPRIGHT, from the right
         turned = np.stack([half * (x + w), half * (y + z), half * (z - y), half * (w - x)], -1)
         return np.concatenate([poses[..., :3] + self._look.places[:, None], turned], -1)
-
-
-def tiled(images: np.ndarray) -> np.ndarray:
-    """Images of worlds side by side in rows that are about as many as columns, world 0 at the upper left; shape ``(height, width[, 3])``."""
-    worlds, height, width = images.shape[:3]
-    columns = math.ceil(math.sqrt(worlds))
-    rows = math.ceil(worlds / columns)
-    grid = np.zeros((rows * columns, *images.shape[1:]), np.uint8)
-    grid[:worlds] = images
-    grid = grid.reshape(rows, columns, height, width, -1).swapaxes(1, 2).reshape(rows * height, columns * width, -1)
-    return grid if images.ndim == 4 else grid[..., 0]
 
 
 def _index(times: np.ndarray, steps: np.ndarray, iteration: int | None, rows: int = 1) -> list[rr.TimeColumn]:

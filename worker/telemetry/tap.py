@@ -199,7 +199,8 @@ class TapReader:
         first = min(end, max(first, int(self._counts[1]) - size + 1))
         self.next = end
         places = np.arange(first, end) % size
-        return Rows(self._tap.layout, first, *(copy.numpy()[places] for copy, _ in self._pairs), lost=first - started)
+        values, marks, images = (copy.numpy()[places] for copy, _ in self._pairs)
+        return Rows(self._tap.layout, first, values, marks, images, first - started)
 
     def _copy(self, first: int, end: int) -> None:
         size = self._tap.layout.rows
