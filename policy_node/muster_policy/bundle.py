@@ -65,7 +65,8 @@ def open_bundle(path: Path) -> Bundle:
             raise Refused(f"{path}: {name} was altered (SHA-256 differs); copy the bundle once more")
         if name in ("contract.json", "policy.onnx", "parity.npz"):
             content[name] = data
-    for name in sorted(_listed(path) - set(manifest["files"]) - {MANIFEST}):
+    names = {str((Path(folder) / name).relative_to(path)) for folder, _, names in os.walk(path) for name in names}
+    for name in sorted(names - set(manifest["files"]) - {MANIFEST}):
         raise Refused(f"{path}: {name} was added, {MANIFEST} does not list it; remove it")
     for name in ("contract.json", "policy.onnx", "parity.npz"):
         if name not in content:
@@ -115,7 +116,3 @@ def _read(path: Path, name: str) -> bytes:
         raise Refused(f"{path}: {name} is missing; {hint}") from None
     except OSError as error:
         raise Refused(f"{path}: {name} can't be read ({error.strerror})") from None
-
-
-def _listed(path: Path) -> set[str]:
-    return {str((Path(folder) / name).relative_to(path)) for folder, _, names in os.walk(path) for name in names}

@@ -35,15 +35,15 @@ episode when std_msgs/Empty arrives on ~/reset. docs/policy-node.md says more.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit status: 0 after a clean end, 1 for a mismatch, 2 for wrong use."""
-    given = parser().parse_args(arguments)
+    options = parser().parse_args(arguments)
     try:
-        bundle = open_bundle(given.bundle)
+        bundle = open_bundle(options.bundle)
         policy = Policy(bundle)
         greatest = policy.self_test(bundle.parity)
         _say(f"{bundle.contract.task} of {bundle.origin}: self-test passed, actions differ by {greatest:.1e} at most")
-        node = PolicyNode(bundle, _settings(given, bundle), policy, _say)
+        node = PolicyNode(bundle, _settings(options, bundle), policy, _say)
         _introduce(node, bundle)
-        if given.check:
+        if options.check:
             return 0
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: node.stopping.set())
@@ -60,10 +60,10 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         words = message.removeprefix("argument ")
         if unknown := re.match(r"unrecognized arguments: (\S+)", message):
-            word, options = unknown[1], [name for name in self._option_string_actions if name.startswith("--")]
+            word = unknown[1]
             words = f"{word}: more arguments than the command takes"
             if word.startswith("-"):
-                near = nearest(word, options)
+                near = nearest(word, [name for name in self._option_string_actions if name.startswith("--")])
                 words = f"{word}: there is no such option" + (f"; {near}" if near.startswith("did") else "")
         elif missing := re.match(r"the following arguments are required: (.*)", message):
             words = f"{missing[1].upper()} is missing"
@@ -118,26 +118,32 @@ def parser() -> argparse.ArgumentParser:
     return found
 
 
-def _settings(given: argparse.Namespace, bundle: Bundle) -> Settings:
+def _settings(options: argparse.Namespace, bundle: Bundle) -> Settings:
     names = [action.name for action in bundle.contract.actions if action.kind != "choice"]
     names += [target.joint for action in bundle.contract.actions for target in action.targets]
     for group in bundle.contract.groups:
         names += [name for term in group.terms if term.element == "joint" for name in term.elements]
+    remap = {}
+    for each in options.remap:
+        topic, sign, name = each.partition(":=")
+        if not (topic and sign and name):
+            raise Refused(f"--remap {each}: expected TOPIC:=NAME, such as imu:=/imu/data")
+        remap[topic] = _ros_name("--remap", name)
     return Settings(
-        rate=given.rate,
-        trigger=given.trigger,
-        timeout=given.timeout,
-        strict=given.strict_limits,
-        controller=given.controller and _ros_name("--controller", given.controller),
-        joints=read_joints(given.joints, names) if given.joints else {},
-        remap=dict(_remapping(each) for each in given.remap),
-        distribution=given.distro,
-        domain=_domain(given.domain),
-        connect=given.connect or (None if given.listen else "tcp/localhost:7447"),
-        listen=given.listen,
-        namespace=_ros_name("--namespace", given.namespace) if given.namespace.strip("/") else "/",
-        name=_ros_name("--name", given.name),
-        duration=given.duration,
+        rate=options.rate,
+        trigger=options.trigger,
+        timeout=options.timeout,
+        strict=options.strict_limits,
+        controller=options.controller and _ros_name("--controller", options.controller),
+        joints=read_joints(options.joints, names) if options.joints else {},
+        remap=remap,
+        distribution=options.distro,
+        domain=_domain(options.domain),
+        connect=options.connect or (None if options.listen else "tcp/localhost:7447"),
+        listen=options.listen,
+        namespace=_ros_name("--namespace", options.namespace) if options.namespace.strip("/") else "/",
+        name=_ros_name("--name", options.name),
+        duration=options.duration,
     )
 
 
@@ -193,13 +199,6 @@ def _introduce(node: PolicyNode, bundle: Bundle) -> None:
         _say(line)
 
 
-def _remapping(text: str) -> tuple[str, str]:
-    topic, sign, name = text.partition(":=")
-    if not (topic and sign and name):
-        raise Refused(f"--remap {text}: expected TOPIC:=NAME, such as imu:=/imu/data")
-    return topic, _ros_name("--remap", name)
-
-
 def _ros_name(option: str, text: str) -> str:
     """A valid ROS name. Raises Refused."""
     parts = text.removeprefix("/").split("/")
@@ -210,11 +209,11 @@ def _ros_name(option: str, text: str) -> str:
     return text
 
 
-def _domain(given: int | None) -> int:
+def _domain(option: int | None) -> int:
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if given is None and not text.isdigit():
+    if option is None and not text.isdigit():
         raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
-    domain = int(text) if given is None else given
+    domain = int(text) if option is None else option
     if not 0 <= domain <= 232:
         raise Refused(f"domain {domain}: expected 0 to 232")
     return domain

@@ -26,8 +26,6 @@ REPORT = 10.0
 """Time between two lines about the loop [s]."""
 PATIENCE = 5.0
 """Time between two lines about missing inputs [s]."""
-
-
 SLOW = 0.8
 """Share of the rate below which the node warns."""
 
@@ -144,7 +142,7 @@ class PolicyNode:
         remap = self.settings.remap
         topics = {each.topic: node.full_name(remap.get(each.topic, each.topic)) for each in self.inputs.all}
         self._topics = topics
-        self.runner.name_topics(topics)
+        self.runner.topics = topics
         out = node.full_name(remap.get("joint_commands", "joint_commands"))
         self._out = node.publisher(out, JOINT_STATE)
         controller = self.settings.controller
@@ -152,27 +150,16 @@ class PolicyNode:
         self._log = node.publisher("/rosout", LOG, Qos(depth=1000, transient_local=True))
         self._diagnostics = node.publisher("/diagnostics", DIAGNOSTICS)
         node.watch_graph()
-        node.subscribe("~/reset", EMPTY, self._hear_reset)
-        node.serve("~/reset", RESET, self._ask_reset)
+        node.subscribe("~/reset", EMPTY, lambda data, kind, type_hash: kind == EMPTY and self._request_reset())
+        node.serve("~/reset", RESET, self._request_reset)
         for each in self.inputs.all:
             node.subscribe(topics[each.topic], each.kind, self.inputs.hear(each, topics[each.topic]))
         self._tell(f"node {node.full_name('~/')[:-1]} of domain {node.domain}: {', '.join(topics.values())} -> {out}")
 
-    def _hear_reset(self, data: bytes, kind: str, type_hash: str) -> None:
-        if kind == EMPTY:
-            self._reset.set()
-
-    def _ask_reset(self, answer: Answer) -> None:
-        self._asking.append(answer)
+    def _request_reset(self, answer: Answer | None = None) -> None:
+        if answer is not None:
+            self._asking.append(answer)
         self._reset.set()
-
-    def _do_reset(self) -> None:
-        """Begin a fresh episode, and tell those that asked before it began."""
-        self._reset.clear()
-        asked = [self._asking.popleft() for _ in range(len(self._asking))]
-        self.runner.reset()
-        for answer in asked:
-            answer(NOTHING)
 
     def _loop(self) -> None:
         gc.collect()
@@ -187,17 +174,23 @@ class PolicyNode:
             if now > ends:
                 break
             if self._reset.is_set():
-                self._do_reset()
-            acted = self.runner.step(now, due=due is not None)
-            if due is not None and acted:
-                self._measure(due, now)
+                self._reset.clear()
+                waiting = [self._asking.popleft() for _ in range(len(self._asking))]
+                self.runner.reset()
+                for answer in waiting:  # those that asked before it began
+                    answer(NOTHING)
+            if self.runner.step(now, due=due is not None) and due is not None:
+                done = time.monotonic()
+                self.figures.add("late", now - due)
+                self.figures.add("step", done - now)
+                self.figures.add("joint state to command", done - self.inputs.all[0].arrived)
             self._flush()
             if now > second:
                 second = now + 1.0
                 self._diagnose()
             if self.runner.mode is Mode.WAITING and now > patience:
                 patience = now + PATIENCE
-                self._tell_missing()
+                self._report_missing()
             if now > report:
                 report = now + REPORT
                 self._tell(self.summary())
@@ -223,12 +216,6 @@ class PolicyNode:
         self._deadline = arrived if arrived > due + period else due  # a late joint state does not delay the next step
         return arrived
 
-    def _measure(self, due: float, now: float) -> None:
-        done = time.monotonic()
-        self.figures.add("late", now - due)
-        self.figures.add("step", done - now)
-        self.figures.add("joint state to command", done - self.inputs.all[0].arrived)
-
     def _publish(self, command: Command) -> None:
         for message in self.commands.joint_states(command, self.messages, time.time_ns()):
             self._out.publish(message)
@@ -248,31 +235,29 @@ class PolicyNode:
             self._log.publish(self.messages.make(LOG, stamp=stamp, level=30 if warning else 20, msg=line, **place))
 
     def _diagnose(self) -> None:
-        make, counts = self.messages.make, self.runner.counts
-        mode, values = self.runner.mode, {"steps": counts.steps, "limited": counts.limited, "stops": counts.stops}
+        make, counts, mode = self.messages.make, self.runner.counts, self.runner.mode
+        values = {"steps": counts.steps, "limited": counts.limited, "stops": counts.stops}
         values["ignored"] = sum(self.inputs.ignored.values())
-        level = {Mode.ACTING: 0, Mode.WAITING: 1, Mode.STOPPED: 2, Mode.ENDED: 2}[mode]
         pairs = [make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in values.items()]
         status = make(
             "diagnostic_msgs/msg/DiagnosticStatus",
-            level=level,
+            level={Mode.ACTING: 0, Mode.WAITING: 1, Mode.STOPPED: 2, Mode.ENDED: 2}[mode],
             name=f"{self._node.name}: policy",
             message=mode.value,
             hardware_id="",
             values=pairs,
         )
-        header = self.messages.header(time.time_ns())
-        self._diagnostics.publish(make(DIAGNOSTICS, header=header, status=[status]))
+        self._diagnostics.publish(make(DIAGNOSTICS, header=self.messages.header(time.time_ns()), status=[status]))
 
-    def _tell_missing(self) -> None:
+    def _report_missing(self) -> None:
         for each in self.inputs.missing():
-            topic = self._topics[each.topic]
-            there = self._node.publishers_of(topic)
-            others = [name for name in self._node.topics_of(each.kind) if name not in (topic, self._out.topic)]
-            if wrong := [other for other in there if other.type != each.kind]:
+            topic, publishers = self._topics[each.topic], self._node.publishers()
+            here = [other for other in publishers if other.name == topic]
+            others = sorted({other.name for other in publishers if other.type == each.kind} - {topic, self._out.topic})
+            if wrong := [other for other in here if other.type != each.kind]:
                 how = f"{wrong[0].node} publishes {wrong[0].type} there"
-            elif there:
-                how = f"{there[0].node} publishes it, and no message could be used yet"
+            elif here:
+                how = f"{here[0].node} publishes it, and no message could be used yet"
             elif others:
                 how = f"nobody publishes it; it may be {others[0]}: --remap {each.topic}:={others[0]}"
             else:

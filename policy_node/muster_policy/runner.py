@@ -69,11 +69,8 @@ class Runner:
         self._silent: set[str] = set()
         self._settled = -float("inf")
         """Time from which inputs count as settled [s, monotonic]."""
-        self._topics: Mapping[str, str] = {}
-
-    def name_topics(self, topics: Mapping[str, str]) -> None:
-        """Give the full names of the inputs' topics, for the lines."""
-        self._topics = topics
+        self.topics: Mapping[str, str] = {}
+        """Full names of the inputs' topics, for the lines."""
 
     def step(self, now: float, due: bool = True) -> bool:
         """Do one control step.
@@ -85,7 +82,7 @@ class Runner:
         Returns:
             Whether a command was given.
         """
-        self.inputs.update(self._topics)
+        self.inputs.update(self.topics)
         for line in self.inputs.complaints():
             self._say(line, True)
         if self.mode in (Mode.STOPPED, Mode.ENDED) or self.inputs.missing():
@@ -167,4 +164,4 @@ class Runner:
         self.observations.reset()
 
     def _topic(self, topic: str) -> str:
-        return self._topics.get(topic, topic)
+        return self.topics.get(topic, topic)

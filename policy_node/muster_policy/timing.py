@@ -32,23 +32,10 @@ class Figures:
         """Add a time [s]."""
         self._kept.setdefault(name, deque(maxlen=KEPT)).append(seconds)
 
-    def percentiles(self, name: str) -> tuple[float, float, float] | None:
-        """Median, 99th percentile and maximum [s]; None without times."""
-        kept = self._kept.get(name)
-        if not kept:
-            return None
-        median, most, greatest = np.percentile(np.fromiter(kept, float), [50, 99, 100])
-        return float(median), float(most), float(greatest)
-
     def line(self) -> str:
-        """All of them as text [ms]."""
+        """Median, 99th percentile and maximum of each kind as text [ms]."""
         parts = []
-        for name in self._kept:
-            found = self.percentiles(name)
-            if found:
-                parts.append(f"{name} p50 {found[0] * 1e3:.3f}, p99 {found[1] * 1e3:.3f}, max {found[2] * 1e3:.2f} ms")
+        for name, kept in self._kept.items():
+            median, most, greatest = 1e3 * np.percentile(np.fromiter(kept, float), [50, 99, 100])
+            parts.append(f"{name} p50 {median:.3f}, p99 {most:.3f}, max {greatest:.2f} ms")
         return "; ".join(parts) or "no step yet"
-
-    def clear(self) -> None:
-        """Delete all times."""
-        self._kept.clear()

@@ -122,7 +122,8 @@ class Replay:
             for kind, topic, time, data in self._messages():
                 if topic == "/tf":
                     if len(found.times) == BATCH:
-                        yield self._part(found)
+                        yield found.part(self.count + 1)
+                        self.count += BATCH
                         found = _Gathered(self.look, found.sums)
                     found.move(time, _decoded(kind, data).transforms)
                 elif topic == "/rosout":
@@ -130,23 +131,11 @@ class Replay:
                     found.log.append((time, line.name, line.msg))
                 elif topic.endswith("/rl/step") and found.times:
                     found.step(time, _decoded(kind, data))
-                elif (seen := _IMAGES.fullmatch(topic)) and found.times:
-                    found.images[seen[2]][len(found.times) - 1].append(bytes(_decoded(kind, data).data))
+                elif (camera := _IMAGES.fullmatch(topic)) and found.times:
+                    found.images[camera[2]][len(found.times) - 1].append(bytes(_decoded(kind, data).data))
         if found.times:
-            yield self._part(found)
-
-    def _part(self, found: _Gathered) -> RecordedSteps:
-        first, self.count = self.count + 1, self.count + len(found.times)
-        steps = np.arange(first, self.count + 1)
-        rewards = np.array([np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in found.rewards])
-        worlds = len(self.look.places)
-        images = {
-            camera: {step: seen for step, seen in steps.items() if len(seen) == worlds}
-            for camera, steps in found.images.items()
-        }
-        return RecordedSteps(
-            np.array(found.times), steps, np.array(found.poses), rewards, found.log, found.returns, images
-        )
+            yield found.part(self.count + 1)
+            self.count += len(found.times)
 
     @contextmanager
     def _ours(self) -> Iterator[None]:
@@ -200,6 +189,17 @@ class _Gathered:
     images: defaultdict[str, defaultdict[int, list[bytes]]] = field(
         default_factory=lambda: defaultdict(lambda: defaultdict(list))
     )
+
+    def part(self, first: int) -> RecordedSteps:
+        """The steps, numbered from ``first``."""
+        rewards = [np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in self.rewards]
+        worlds, count = len(self.look.places), len(self.times)
+        images = {
+            camera: {step: seen for step, seen in steps.items() if len(seen) == worlds}
+            for camera, steps in self.images.items()
+        }
+        arrays = np.array(self.times), np.arange(first, first + count), np.array(self.poses), np.array(rewards)
+        return RecordedSteps(*arrays, self.log, self.returns, images)
 
     def move(self, time: int, transforms: list[Any]) -> None:
         parts = [(each.transform.translation, each.transform.rotation) for each in transforms]
