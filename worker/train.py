@@ -64,7 +64,7 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
 def hooks() -> list[Hook]:
     """What watches a training, and what follows its end."""
     from worker.evaluation.final_evaluation import FinalEvaluation
-    from worker.telemetry.live_tap import LiveTap
+    from worker.telemetry.tap import LiveTap
 
     def draw(worlds: Task) -> EpisodePicture:
         from worker.telemetry.picture import EpisodePicture  # it takes a while, and most jobs of a sweep draw nothing

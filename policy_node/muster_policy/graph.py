@@ -28,7 +28,7 @@ from muster_policy.wire import (
     topic_key,
 )
 
-Received = Callable[[bytes, str, str], object]
+Received = Callable[[bytes, str, str], None]
 """Called with a message's bytes, its ROS type and its type hash, on Zenoh's own thread."""
 Answer = Callable[[bytes], None]
 """Answers a request of a service with the bytes of its response; to be called once, on any thread."""

@@ -14,12 +14,11 @@ from muster_policy.bundle import Bundle
 from muster_policy.errors import Refused
 from muster_policy.graph import Answer, Node, open_session
 from muster_policy.inputs import Inputs
-from muster_policy.lines import Lines
 from muster_policy.messages import ARRAY, DIAGNOSTICS, EMPTY, JOINT_STATE, LOG, NOTHING, RESET, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 from muster_policy.runner import Mode, Runner
-from muster_policy.timing import Figures, sleep_until
+from muster_policy.timing import Figures, Lines, sleep_until
 from muster_policy.wire import Qos
 
 REPORT = 10.0
@@ -150,7 +149,12 @@ class PolicyNode:
         self._log = node.publisher("/rosout", LOG, Qos(depth=1000, transient_local=True))
         self._diagnostics = node.publisher("/diagnostics", DIAGNOSTICS)
         node.watch_graph()
-        node.subscribe("~/reset", EMPTY, lambda data, kind, type_hash: kind == EMPTY and self._request_reset())
+
+        def heard(data: bytes, kind: str, type_hash: str) -> None:
+            if kind == EMPTY:
+                self._request_reset()
+
+        node.subscribe("~/reset", EMPTY, heard)
         node.serve("~/reset", RESET, self._request_reset)
         for each in self.inputs.all:
             node.subscribe(topics[each.topic], each.kind, self.inputs.hear(each, topics[each.topic]))

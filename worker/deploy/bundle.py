@@ -6,7 +6,7 @@
 ``contract.json``   what goes in and what comes out (:mod:`shared_store.contract.policy`)
 ``parity.npz``      observations of roll-outs, and what the trained policy did: a self-test for who runs the bundle
 ``report.json``     how the files were compared with the trained policy, and how both did on the same worlds
-``leapp.yaml``      the same inputs and outputs as NVIDIA's LEAPP describes them (:mod:`worker.deploy.leapp_description`)
+``leapp.yaml``      the same inputs and outputs as NVIDIA's LEAPP describes them (:mod:`worker.deploy.model_file`)
 ``robot/``          the robot's model, where its licence allows a copy
 ``*.json``          what the task and plug-ins say besides
 ``README.md``       what is what, and licences
@@ -20,11 +20,13 @@ import contextlib
 import hashlib
 import inspect
 import io
+import json
 import platform
+import re
 import shutil
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -32,21 +34,34 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import worker.tasks.library
 from shared_store import __version__
+from shared_store.contract.error_text import shown
+from shared_store.contract.plugins import blamed, load, plugins
 from shared_store.contract.policy import Contract
-from shared_store.volume.bundles import CONTRACT, REPORT, publish, seal
+from shared_store.volume.bundles import CONTRACT, MANIFEST, REPORT, publish, seal
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.files import remove_tree, write_json
 from shared_store.volume.layout import Run
-from worker.deploy import parity, rollouts
-from worker.deploy.bundle_documents import bundle_documents
-from worker.deploy.leapp_description import LEAPP, leapp_description
-from worker.deploy.model_file import OPSET, OnnxPolicy, ScriptPolicy, metadata_of, to_onnx, to_torchscript
-from worker.deploy.robots import add_robot
+from worker.deploy import parity
+from worker.deploy.model_file import (
+    LEAPP,
+    OPSET,
+    OnnxPolicy,
+    ScriptPolicy,
+    leapp_description,
+    metadata_of,
+    to_onnx,
+    to_torchscript,
+)
+from worker.settings.errors import UserError
+from worker.simulation import robot_files
+from worker.tasks.run.declared import DeclaredTask
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy, Policy
     from worker.tasks.run.task import Task
+
 
 COPIED = ("iteration", "reward", "score", "score_error", "score_episodes", "env_steps", "algorithm")
 """Keys that a bundle's manifest repeats from its checkpoint's."""
@@ -149,9 +164,9 @@ def export(
     exported = policy.module()
     groups = {group.input: group.name for group in contract.groups}
     begin = task.state_dict()
-    extremes = rollouts.Extremes(acting, groups) if all(len(group.shape) == 1 for group in contract.groups) else None
-    trained = rollouts.play(task, extremes or acting, rounds) if rounds else None
-    recordings = {"rollout": rollouts.record(task, acting, groups)}
+    extremes = parity.Extremes(acting, groups) if all(len(group.shape) == 1 for group in contract.groups) else None
+    trained = parity.play(task, extremes or acting, rounds) if rounds else None
+    recordings = {"rollout": parity.record(task, acting, groups)}
     if extremes and rounds:
         recordings["extremes"] = parity.single(extremes.inputs())
     run_path = f"{run.name}/{checkpoint.name}"
@@ -159,9 +174,9 @@ def export(
     report: dict[str, Any] = {"parity": files.report, "judged": None}
     if trained:
         task.load_state_dict(begin)  # the same worlds, and the same random numbers from there on
-        played = rollouts.play(task, OnnxPolicy(files.onnx, contract), rounds)
+        played = parity.play(task, OnnxPolicy(files.onnx, contract), rounds)
         runtime = f"onnxruntime {metadata.version('onnxruntime')}"
-        report["judged"] = {"runtime": runtime, **rollouts.judge(trained, played)}
+        report["judged"] = {"runtime": runtime, **parity.judge(trained, played)}
     return _publish(run, checkpoint, task, contract, files, documents, {**report, "changed_robot": changes or None})
 
 
@@ -248,3 +263,103 @@ From run {run.name}, checkpoint {checkpoint.name}, iteration {checkpoint.iterati
 
 The policy, the contract and the recordings belong to whoever trained the policy; Muster claims no rights in them. {about}
 """
+
+
+_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,194}\.json")
+_TAKEN = (CONTRACT, MANIFEST, REPORT)
+"""Files of this form that every bundle has."""
+
+
+def bundle_documents(task: Task, algorithm: str) -> dict[str, Mapping[str, Any]]:
+    """The further documents of the bundle of a policy that ``algorithm``, a name, trained; by the names of their files.
+
+    Raises UserError, which names the task or the plug-in: the documents are no JSON objects, or have a name that is not a plain one, is
+    that of a file of every bundle, or is another's. Raises PluginError where a plug-in can't make them.
+    """
+    found: dict[str, Mapping[str, Any]] = {}
+    by: dict[str, str] = {}
+    for source, documents in _sources(task, algorithm):
+        for name, document in documents.items():
+            if not isinstance(name, str) or not _NAME.fullmatch(name):
+                problem = f"{shown(name)} can't be a file of a bundle; use a plain name such as notes.json"
+            elif name in _TAKEN:
+                problem = f"{name} is a file of every bundle; give the document another name"
+            elif name in by:
+                problem = f"{by[name]} puts {name} into bundles, too; give one of the two documents another name"
+            elif not _is_object(document):
+                problem = f"{name} is not a JSON object; return a mapping of texts to JSON values"
+            else:
+                found[name], by[name] = document, source
+                continue
+            raise UserError(f"{source}: {problem}")
+    return found
+
+
+def _is_object(document: object) -> bool:
+    try:
+        return isinstance(document, Mapping) and bool(json.dumps(dict(document)))
+    except (TypeError, ValueError):
+        return False
+
+
+def _sources(task: Task, algorithm: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    if isinstance(task, DeclaredTask):
+        yield f"task {type(task).__name__}: bundle_documents", task.bundle_documents(algorithm)
+    for name, plugin in plugins().items():
+        if place := plugin.bundle_parts:
+            with blamed(place):
+                documents = load(place)(task)
+            source = f"plug-in {name}: bundle_parts"
+            if not isinstance(documents, Mapping):
+                raise UserError(f"{source}: {place} returned {shown(documents)}; return documents by their names")
+            yield source, documents
+
+
+_OWN = Path(worker.tasks.library.__file__).parent
+
+
+def add_robot(task: Task, bundle: Path) -> dict[str, Any] | None:
+    """Put the model of the task's robot into ``robot/`` of a bundle where its licence is known to allow that; returns what it is.
+
+    Files of other packages and of users are named with their package and its licence, and not copied: meshes may have licences of
+    their own. None of a task of kernels by hand, which does not say what its robot is.
+    """
+    declare = getattr(task, "robot", None)
+    if declare is None:
+        return None
+    robot = declare(task.config)
+    text = str(robot.file)
+    found = robot_files.read(text)
+    if text.lstrip().startswith("<"):
+        name = f"robot.{'xml' if found.format == 'mjcf' else found.format}"
+        _write(bundle / "robot" / name, text.encode())
+        return {
+            "source": "the task's own source",
+            "format": found.format,
+            "licence": "the task's",
+            "file": f"robot/{name}",
+        }
+    path = Path(found.source)
+    if path.parent == _OWN:
+        _write(bundle / "robot" / path.name, path.read_bytes())
+        return {"source": path.name, "format": found.format, "licence": "Apache-2.0", "file": f"robot/{path.name}"}
+    scheme, _, inside = text.partition(":")
+    package = {"package": inside.partition("/")[0], "newton": "newton"}.get(scheme)
+    return {"source": text, "format": found.format, **_package(package), "file": None}
+
+
+def _package(name: str | None) -> dict[str, str]:
+    if name is None:
+        return {"licence": "not known: a file of the task's author"}
+    try:
+        about = metadata.metadata(name)
+    except metadata.PackageNotFoundError:
+        return {"package": name, "licence": "not known"}
+    named = (about[key] for key in ("License-Expression", "License") if key in about)
+    licence = next(filter(None, named), "not known")
+    return {"package": f"{name} {about['Version']}", "licence": f"{licence.splitlines()[0]} (of the package)"}
+
+
+def _write(path: Path, data: bytes) -> None:
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)

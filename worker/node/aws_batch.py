@@ -26,7 +26,7 @@ from shared_store.volume.logs import OUTCOME_LINE, format_line, format_lines
 from shared_store.volume.node_outcomes import EX_TEMPFAIL, Outcome
 from worker.node import supervisor
 from worker.node.lifeline import ChildEnd, Loss, MainEnd
-from worker.node.network import address_towards
+from worker.node.surroundings import address_towards
 
 _PEER_GRACE = 5.0
 """Seconds that the main node's ranks get after a child died: their collectives are broken, there is nothing to save."""

@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 from shared_store.contract.node import NodeContract, sealed
 from shared_store.process.ports import free_port
 from shared_store.process.shim import shimmed
-from worker.node.network import address_towards
+from worker.node.surroundings import address_towards
 
 
 def meet() -> str:

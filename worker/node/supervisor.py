@@ -31,10 +31,8 @@ from shared_store.volume.log_files import LogWriter, left_out
 from shared_store.volume.logs import END_LINE, format_line, format_lines
 from shared_store.volume.node_outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
 from worker.node.bus import BusCommand, NodeBus
-from worker.node.network import interface_of
-from worker.node.rank import Rank, adopt_orphans, kill_group
-from worker.node.stacks import dump_stacks, state_of
-from worker.node.surroundings import MemoryLimit, Surroundings
+from worker.node.rank import Rank, adopt_orphans, dump_stacks, kill_group, state_of
+from worker.node.surroundings import MemoryLimit, Surroundings, interface_of
 
 _PEER_GRACE = 5.0
 """Seconds that the other ranks of a node get after one of them failed: their collectives are broken, there is nothing to save."""

@@ -8,13 +8,17 @@ variables those only that say where things are: language, time zone, proxies, ce
 from __future__ import annotations
 
 import errno
+import ipaddress
 import os
 import pwd
 import shutil
+import socket
 import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
+
+import psutil
 
 from shared_store.contract.node import NodeContract, job_variables, rank_variables
 from shared_store.process.memory_groups import killed_for_memory, make_memory_group
@@ -112,3 +116,22 @@ class MemoryLimit:
         if self.group and not self._used_up:
             self._used_up = killed_for_memory(self.group)
         return self._used_up
+
+
+def interface_of(address: str | None, peer: str) -> str | None:
+    """Name of the interface that holds ``address``, or, without one, of that which leads to ``peer``; None if none does."""
+    try:
+        found = ipaddress.ip_address(address or address_towards(peer))
+    except (OSError, ValueError):
+        return None
+    if found.is_loopback:
+        return "lo"  # the whole of 127.0.0.0/8 is on it
+    interfaces = psutil.net_if_addrs().items()
+    return next((name for name, held in interfaces if any(each.address == str(found) for each in held)), None)
+
+
+def address_towards(peer: str) -> str:
+    """This node's IPv4 address on the route to ``peer``. Raises OSError."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect((peer, 9))  # sends nothing: it only asks the kernel for the route
+        return str(probe.getsockname()[0])

@@ -21,8 +21,7 @@ from shared_store.volume.logs import LogLine
 from shared_store.volume.metrics import history_of
 from worker.settings.errors import UserError
 from worker.telemetry.progress import Activity
-from worker.telemetry.recording import Recording
-from worker.telemetry.recovering import recover
+from worker.telemetry.recording import Recording, recover
 from worker.telemetry.tap_request import PATIENCE, TapRequest
 
 

@@ -36,8 +36,8 @@ from worker.telemetry.rows import Layout, Rows
 from worker.telemetry.tap_request import PATIENCE, TapRequest
 
 if TYPE_CHECKING:
+    from worker.telemetry.rows import Segment
     from worker.telemetry.screen import Screen
-    from worker.telemetry.segment import Segment
     from worker.telemetry.stage import Stage
 
 HZ = 20.0

@@ -143,7 +143,7 @@ def png(image: np.ndarray) -> np.ndarray:
     return np.frombuffer(buffer.getvalue(), np.uint8)
 
 
-def tiled(images: Sequence[np.ndarray], columns: int, gap: int = 0, ground: int = 255) -> np.ndarray:
+def tiled(images: Sequence[np.ndarray] | np.ndarray, columns: int, gap: int = 0, ground: int = 255) -> np.ndarray:
     """Images of one size row by row in one, ``gap`` [px] from each other, on a ground of one brightness; uint8."""
     height, width, *channels = images[0].shape
     high, wide, rows = height + gap, width + gap, math.ceil(len(images) / columns)

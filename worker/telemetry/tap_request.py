@@ -1,6 +1,6 @@
 """A reader's request for the tap of a training on this machine, for a live recording or view; and the response to it.
 
-The training's side is :mod:`worker.telemetry.live_tap`.
+The training's side is :mod:`worker.telemetry.tap`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,7 @@ from shared_store.volume.files import DamagedFile, read_json, write_json
 from shared_store.volume.layout import Run
 from worker.settings.errors import UserError
 from worker.telemetry.progress import Activity, loading
-from worker.telemetry.rows import Layout
-from worker.telemetry.segment import Segment
+from worker.telemetry.rows import Layout, Segment
 
 if TYPE_CHECKING:
     from worker.telemetry.stage import Stage

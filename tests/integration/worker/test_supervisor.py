@@ -211,6 +211,7 @@ BY_ENGINE = "a node is started by one of Muster's engines"
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ({"EPOCH": ""}, "RUN/EPOCH: expected a whole number of at most 15 digits, found ''"),
         ({"MUSTER_JOB_ID": None}, f"MUSTER_JOB_ID is missing; {BY_ENGINE}"),
         ({"MUSTER_STORE": None}, f"MUSTER_STORE is missing; {BY_ENGINE}"),
         ({"MUSTER_EPOCH": "x"}, f"MUSTER_EPOCH is 'x', not a whole number; {BY_ENGINE}"),
@@ -224,19 +225,13 @@ def test_a_broken_contract_is_one_line(node: Nodes, tmp_path: Path, change: dict
     for name, value in change.items():
         if value is None:
             del n.environment[name]
+        elif name == "EPOCH":
+            (n.run.path / name).write_text(value)
         else:
             n.environment[name] = value
     assert n.call("touch", str(tmp_path / "started")) == 2
-    assert n.stderr.read_text() == f"muster supervisor: {said}\n"
+    assert n.stderr.read_text() == f"muster supervisor: {said.replace('RUN', str(n.run.path))}\n"
     assert not (tmp_path / "started").exists()
-
-
-def test_a_damaged_epoch_file_is_reported_in_one_line(node: Nodes) -> None:
-    n = node()
-    (n.run.path / "EPOCH").write_text("")
-    assert n.call("true") == 2
-    said = f"muster supervisor: {n.run.path}/EPOCH: expected a whole number of at most 15 digits, found ''\n"
-    assert n.stderr.read_text() == said
 
 
 def test_a_store_that_is_not_the_controllers_is_reported_before_any_start(node: Nodes, tmp_path: Path) -> None:

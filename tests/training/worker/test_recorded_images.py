@@ -23,11 +23,10 @@ from worker.learning.reporter import Gate
 from worker.settings.overrides import configured
 from worker.tasks.library.cartpole_pixels import CartpolePixels
 from worker.telemetry.live_recording import record
-from worker.telemetry.live_tap import LiveTap
 from worker.telemetry.live_view import TrainingView
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
-from worker.telemetry.tap import Tap, TapReader
+from worker.telemetry.tap import LiveTap, Tap, TapReader
 
 torch.set_num_threads(1)
 CONFIG = {"episode_seconds": 0.2, "camera": {"width": 12, "height": 8}}
@@ -72,7 +71,7 @@ class Running:
 
 @pytest.fixture
 def running(task: CartpolePixels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
-    monkeypatch.setattr("worker.telemetry.live_tap.POLL_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     running = Running(task, Run(tmp_path / "run"))
     yield running
     running.close()

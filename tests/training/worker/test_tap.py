@@ -18,10 +18,8 @@ from tests.support.waiting import wait_for
 from worker.learning.reporter import Gate
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.live_tap import LiveTap
-from worker.telemetry.rows import MARKS, Layout, Rows
-from worker.telemetry.segment import Segment
-from worker.telemetry.tap import Tap, TapReader
+from worker.telemetry.rows import MARKS, Layout, Rows, Segment
+from worker.telemetry.tap import LiveTap, Tap, TapReader
 from worker.telemetry.tap_request import request_of, response_of
 
 torch.set_num_threads(1)
@@ -160,7 +158,7 @@ def test_memory_of_another_layout_is_refused(tmp_path: Path) -> None:
 def test_a_training_answers_a_request_between_two_iterations_and_stops_when_the_reader_is_gone(
     task: Cartpole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.telemetry.live_tap.POLL_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     run = Run(tmp_path / "run")
     tap = LiveTap()
     tap.serve(run, task, Gate())
@@ -182,7 +180,7 @@ def test_a_training_answers_a_request_between_two_iterations_and_stops_when_the_
 def test_a_request_from_another_machine_is_answered_with_the_reason(
     task: Cartpole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.telemetry.live_tap.POLL_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     run = Run(tmp_path / "run")
     tap = LiveTap()
     tap.serve(run, task, Gate())

@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from muster_policy import lines as module
+from muster_policy import timing as module
 from muster_policy.actions import Commands, limits
 from muster_policy.bundle import open_bundle
 from muster_policy.errors import Refused
 from muster_policy.inputs import Inputs
-from muster_policy.lines import Lines
 from muster_policy.messages import JOINT_STATE, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 from muster_policy.runner import Mode, Runner
+from muster_policy.timing import Lines
 from shared_store.contract.policy import Action
 from tests.support.policy_node import for_node, write_bundle
 from tests.support.refusals import refusal

@@ -8,8 +8,8 @@ import pytest
 
 from shared_store.contract import plugins as contract
 from shared_store.contract.plugins import Plugin, PluginError
-from worker.deploy import bundle_documents as module
-from worker.deploy.bundle_documents import bundle_documents
+from worker.deploy import bundle as module
+from worker.deploy.bundle import bundle_documents
 from worker.settings.errors import UserError
 from worker.tasks.library.cartpole import Cartpole
 

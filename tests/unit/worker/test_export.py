@@ -25,10 +25,8 @@ from tests.support.worker.rsl_loop import GRU, GroupedPoint, build, train
 from tests.support.worker.sac import make, point
 from worker.deploy import bundle
 from worker.deploy.bundle import Files, _publish, bundle_files
-from worker.deploy.leapp_description import leapp_description
-from worker.deploy.model_file import OnnxPolicy, metadata_of, to_onnx
-from worker.deploy.parity import RecordedObservations
-from worker.deploy.rollouts import judge
+from worker.deploy.model_file import OnnxPolicy, leapp_description, metadata_of, to_onnx
+from worker.deploy.parity import RecordedObservations, judge
 from worker.evaluation.episodes import Episodes
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.trained import load_policy
