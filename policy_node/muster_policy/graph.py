@@ -140,8 +140,8 @@ class Node:
         key = topic_key(self.domain, full, "*", "*")
         self._ears.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(hear, indirect=False)))
 
-    def serve(self, name: str, kind: str, asked: Callable[[Answer], None]) -> None:
-        """Offer a service of a ROS type without parameters: ``asked`` gets the answer to each request, and must not wait for anything."""
+    def serve(self, name: str, kind: str, requested: Callable[[Answer], None]) -> None:
+        """Offer a service of a ROS type without parameters: ``requested`` gets the answer to each request, and must not wait for anything."""
         full = self.full_name(name)
         _, key = self.declare("SS", full, kind, Qos())
 
@@ -154,7 +154,7 @@ class Node:
                 with contextlib.suppress(zenoh.ZError), query:
                     query.reply(key, data, attachment=attachment(known[0], time.time_ns(), known[2]))
 
-            asked(answer)
+            requested(answer)
 
         ear = zenoh.handlers.Callback(hear, indirect=False)
         # clients of rmw_zenoh ask complete queryables alone

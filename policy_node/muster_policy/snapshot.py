@@ -126,8 +126,8 @@ def _odometry(snapshot: Snapshot) -> Odometry:
 
 def _velocity(snapshot: Snapshot, place: Place) -> np.ndarray:
     """Of the frame's origin, along its own axes."""
-    there = _odometry(snapshot)
-    found: np.ndarray = place.turn.T @ (there.linear + cross(there.angular, place.arm))
+    odometry = _odometry(snapshot)
+    found: np.ndarray = place.turn.T @ (odometry.linear + cross(odometry.angular, place.arm))
     return found
 
 

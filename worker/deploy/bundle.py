@@ -238,7 +238,7 @@ def _publish(
 def _readme(
     run: Run, checkpoint: Checkpoint, contract: Contract, robot: Mapping[str, Any] | None, documents: Sequence[str]
 ) -> str:
-    """For a person who finds the bundle."""
+    """The text of ``README.md``."""
     if robot is None:
         about = "The task does not say which file its robot comes from."
     elif robot["file"]:

@@ -194,7 +194,7 @@ class Supervisor:
         """Whether the rank has reported no iteration for too long; then its stacks are in the log."""
         if (timeout := self.contract.stall_timeout) is None:
             return False
-        # before the first iteration (kernels are compiled) and after the last (evaluation) there is no measure but patience
+        # before the first iteration (kernels are compiled) and after the last (evaluation) only the time limits tell a stall
         since, limit = (rank.heard, timeout) if rank.heard is not None else (rank.spoke, max(timeout, _PATIENCE))
         if (silence := time.monotonic() - since) < limit:
             return False

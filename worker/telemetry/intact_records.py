@@ -10,7 +10,8 @@ import re
 import struct
 import zlib
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,27 +89,20 @@ def identify(record: bytes) -> tuple[int, str]:
 
 def places(data: mmap.mmap, start: int) -> Iterator[int]:
     """Where a record may begin, from ``start`` on, in order; all but those of the summary."""
-    return heapq.merge(_openings(data, start), _chunks(data, start))
 
+    def opening(at: int) -> int:
+        # a match that a suspended generator held would keep the file's map open
+        found = _BEGIN.search(data, at)
+        return found.start() if found else -1
 
-def _openings(data: mmap.mmap, start: int) -> Iterator[int]:
-    while (start := _opening(data, start)) >= 0:
-        yield start
-        start += 1
+    def found_by(find: Callable[[int], int], before: int) -> Iterator[int]:
+        at = start + before
+        while (at := find(at)) >= 0:
+            yield at - before
+            at += 1
 
-
-def _opening(data: mmap.mmap, start: int) -> int:
-    # a match that a suspended generator held would keep the file's map open
-    found = _BEGIN.search(data, start)
-    return found.start() if found else -1
-
-
-def _chunks(data: mmap.mmap, start: int) -> Iterator[int]:
-    before = 9 + _BEFORE_COMPRESSION
-    search = start + before
-    while (found := data.find(COMPRESSION, search)) >= 0:
-        yield found - before
-        search = found + 1
+    chunks = found_by(partial(data.find, COMPRESSION), 9 + _BEFORE_COMPRESSION)
+    return heapq.merge(found_by(opening, 0), chunks)
 
 
 CHANNELS = "channels.json"

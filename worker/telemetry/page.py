@@ -24,7 +24,6 @@ from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
 from urllib.parse import urlencode, urlsplit
 
 from shared_store.process.tether import tied
@@ -126,9 +125,7 @@ class ViewerPage:
     def __enter__(self) -> ViewerPage:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._http.shutdown()
         self.close()
 

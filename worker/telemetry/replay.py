@@ -83,7 +83,7 @@ class Replay:
         cameras: list[str] = []
         terms: tuple[str, ...] | None = None
         steps = False
-        with self._ours():
+        with self._own_messages():
             for kind, topic, _, data in self._messages():
                 if topic == "/tf" and terms is not None:
                     break  # the first step is over
@@ -118,7 +118,7 @@ class Replay:
     def parts(self) -> Iterator[RecordedSteps]:
         """All control steps, in order."""
         found = _Gathered(self.look)
-        with self._ours():
+        with self._own_messages():
             for kind, topic, time, data in self._messages():
                 if topic == "/tf":
                     if len(found.times) == BATCH:
@@ -138,8 +138,8 @@ class Replay:
             self.count += len(found.times)
 
     @contextmanager
-    def _ours(self) -> Iterator[None]:
-        """Refuse what is not as Muster writes it. Raises UserError."""
+    def _own_messages(self) -> Iterator[None]:
+        """A context that reads Muster's messages. Raises UserError for messages of another form."""
         try:
             yield
         except UserError:

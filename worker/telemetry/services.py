@@ -55,7 +55,7 @@ class TrainingEnd:
 
 
 class Service:
-    """One of the services. What it can't do now it raises, and the caller tries again.
+    """One of the services. Each method may raise any error of the service; the caller tries again.
 
     Args:
         tracked: The run.
