@@ -16,8 +16,8 @@ from muster_policy.bundle import Bundle, open_bundle
 from muster_policy.errors import Refused, nearest
 from muster_policy.messages import DISTRIBUTIONS
 from muster_policy.node import PolicyNode, Settings
+from muster_policy.observations import IMU
 from muster_policy.policy import Policy
-from muster_policy.snapshot import IMU
 
 EXAMPLES = """\
 examples:

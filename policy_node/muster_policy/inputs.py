@@ -15,10 +15,19 @@ import numpy as np
 from muster_policy.contract import Command, Group
 from muster_policy.errors import Refused, nearest
 from muster_policy.messages import ARRAY, IMAGE, IMU, JOINT_STATE, ODOMETRY, TWIST, Messages
-from muster_policy.observations import Observations, command_topic, image_topic, is_twist
-from muster_policy.snapshot import IMU as IMU_TOPIC
-from muster_policy.snapshot import JOINTS, Imu, Odometry, Snapshot, matrix
-from muster_policy.snapshot import ODOMETRY as ODOMETRY_TOPIC
+from muster_policy.observations import IMU as IMU_TOPIC
+from muster_policy.observations import (
+    JOINTS,
+    Imu,
+    Observations,
+    Odometry,
+    Snapshot,
+    command_topic,
+    image_topic,
+    is_twist,
+    matrix,
+)
+from muster_policy.observations import ODOMETRY as ODOMETRY_TOPIC
 
 COMMAND_TIMEOUT = 0.5
 """Age from which a commanded velocity no longer counts: the policy is then commanded to stand [s]."""

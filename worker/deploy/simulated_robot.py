@@ -97,7 +97,7 @@ class SimulatedRobot:
 
     def _root(self, nanoseconds: int) -> list[Message]:
         """IMU and odometry from the pose and velocities of the free root."""
-        from muster_policy.snapshot import matrix
+        from muster_policy.observations import matrix
 
         make, header, vector = self.messages.make, self.messages.header, self.messages.vector
         view, arrays, coms = self._view, self.task.worlds.arrays, self.task.worlds.model.body_com

@@ -76,10 +76,12 @@ class WorldsView:
 
     def _draw(self, screen: Screen, rows: Rows, number: int) -> None:
         """Show the newest of some rows, control step ``number``."""
-        now, steps, poses = np.array([time.time_ns()]), np.array([number]), self._stage.pose(rows.coordinates[-1])
-        screen.frames(now, steps, poses[None], rows.terms[-1:].mean(1), self._iteration)
-        for camera, images in rows.pictures(-1).items():
-            screen.images(camera, now, steps, [images], self._iteration)
+        from worker.telemetry.screen import Steps
+
+        poses = self._stage.pose(rows.coordinates[-1])[None]
+        images = {camera: {0: seen} for camera, seen in rows.pictures(-1).items()}
+        now, rewards = np.array([time.time_ns()]), rows.terms[-1:].mean(1)
+        screen.show(Steps(now, np.array([number]), poses, rewards, self._iteration, images))
         self.frames += 1
 
 
@@ -248,11 +250,7 @@ def show_file(path: Path, start: Callable[[Path | None], ViewerPage], stop: list
     with start(None) as page, closing(Screen(page.server, path.name, replay.look, live=False)) as screen:
         for part in replay.parts():
             page.check()
-            screen.frames(part.times, part.steps, part.poses, part.rewards)
-            for camera in replay.look.cameras:
-                screen.images(camera, *part.pictures(camera))
-            screen.log(part.log)
-            screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
+            screen.show(part)
             if stop:
                 return
         if replay.losses:

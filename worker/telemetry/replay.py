@@ -12,49 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from worker.settings.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.intact_records import SoundRecords
 from worker.telemetry.recording import PARTIAL
-from worker.telemetry.screen import Appearance
+from worker.telemetry.screen import Appearance, Steps
 
 BATCH = 256
 """Control steps that are handed out together."""
 _IMAGES = re.compile(r"/world_(\d+)/(.+)/image/compressed")
 """World and camera."""
-
-
-@dataclass
-class RecordedSteps:
-    """Consecutive control steps of a recording.
-
-    Attributes:
-        times: [ns since 1970].
-        steps: Numbers, from 1.
-        poses: Shape ``(steps, worlds, links, 7)``: position [m] and quaternion xyzw in the frame of the world.
-        rewards: Weighted terms, mean of the worlds; shape ``(steps, terms)``.
-        log: Lines of the log: time [ns], source, text.
-        returns: Of episodes that ended: time [ns], return.
-        images: By camera and step, PNG of each world; steps of which none is there, or not of every world, have none.
-    """
-
-    times: np.ndarray
-    steps: np.ndarray
-    poses: np.ndarray
-    rewards: np.ndarray
-    log: list[tuple[int, str, str]]
-    returns: list[tuple[int, float]]
-    images: dict[str, dict[int, list[bytes]]] = field(default_factory=dict)
-
-    def pictures(self, camera: str) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Times, numbers and images of the steps of which a camera has images, as :meth:`worker.telemetry.screen.Screen.images` takes them."""
-        from PIL import Image
-
-        found = self.images.get(camera, {})
-        seen = [np.stack([np.asarray(Image.open(io.BytesIO(each))) for each in worlds]) for worlds in found.values()]
-        places = list(found)
-        return self.times[places], self.steps[places], seen
 
 
 class Replay:
@@ -115,7 +84,7 @@ class Replay:
         what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
         raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
 
-    def parts(self) -> Iterator[RecordedSteps]:
+    def parts(self) -> Iterator[Steps]:
         """All control steps, in order."""
         found = _Gathered(self.look)
         with self._own_messages():
@@ -190,16 +159,20 @@ class _Gathered:
         default_factory=lambda: defaultdict(lambda: defaultdict(list))
     )
 
-    def part(self, first: int) -> RecordedSteps:
-        """The steps, numbered from ``first``."""
+    def part(self, first: int) -> Steps:
+        """The steps, numbered from ``first``; those without an image of every world have none."""
         rewards = [np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in self.rewards]
         worlds, count = len(self.look.places), len(self.times)
         images = {
-            camera: {step: seen for step, seen in steps.items() if len(seen) == worlds}
+            camera: {
+                step: np.stack([np.asarray(Image.open(io.BytesIO(each))) for each in files])
+                for step, files in steps.items()
+                if len(files) == worlds
+            }
             for camera, steps in self.images.items()
         }
         arrays = np.array(self.times), np.arange(first, first + count), np.array(self.poses), np.array(rewards)
-        return RecordedSteps(*arrays, self.log, self.returns, images)
+        return Steps(*arrays, images=images, log=self.log, returns=self.returns)
 
     def move(self, time: int, transforms: list[Any]) -> None:
         parts = [(each.transform.translation, each.transform.rotation) for each in transforms]

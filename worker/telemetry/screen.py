@@ -9,7 +9,7 @@ import contextlib
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -56,6 +56,31 @@ class Appearance:
     cameras: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Steps:
+    """Consecutive control steps of the worlds.
+
+    Attributes:
+        times: [ns since 1970], shape ``(steps,)``.
+        steps: Their numbers.
+        poses: Position [m] and quaternion xyzw of the links in their worlds, shape ``(steps, worlds, links, 7)``.
+        rewards: Weighted reward terms, mean of the worlds; shape ``(steps, terms)``.
+        iteration: Of the training, where there is one.
+        images: By camera and index of the step: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
+        log: Lines: time [ns], source, text.
+        returns: Of episodes that ended: time [ns], return.
+    """
+
+    times: np.ndarray
+    steps: np.ndarray
+    poses: np.ndarray
+    rewards: np.ndarray
+    iteration: int | None = None
+    images: Mapping[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
+    log: Sequence[tuple[int, str, str]] = ()
+    returns: Sequence[tuple[int, float]] = ()
+
+
 class Screen:
     """A stream to Rerun's server.
 
@@ -68,82 +93,52 @@ class Screen:
 
     def __init__(self, server: str | Path, title: str, look: Appearance, live: bool) -> None:
         self._look, self._live, self._is_aimed = look, live, False
-        self._terms: list[tuple[np.ndarray, np.ndarray, np.ndarray, int | None]] = []
-        """The rows that :meth:`frames` has not sent yet: times, steps, reward terms, iteration."""
+        self._pending: list[Steps] = []
+        """Those whose reward terms are not sent yet."""
         self._rr = rr.RecordingStream("muster")
         self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
         self._rr.send_recording_name(title)
         self._log_fixed()
 
-    def frames(
-        self, times: np.ndarray, steps: np.ndarray, poses: np.ndarray, rewards: np.ndarray, iteration: int | None = None
-    ) -> None:
-        """Show control steps; with the first of all, the eye is placed.
-
-        Args:
-            times: Of each [ns since 1970], shape ``(steps,)``.
-            steps: Their numbers.
-            poses: Position [m] and quaternion xyzw of the links in their worlds, shape ``(steps, worlds, links, 7)``.
-            rewards: Weighted reward terms, mean of the worlds; shape ``(steps, terms)``.
-            iteration: Of the training, where there is one.
-        """
-        if not len(times):
-            return
-        placed = self._placed(poses)
+    def show(self, shown: Steps) -> None:
+        """Show control steps; with the first of all, the eye is placed."""
+        count, placed = len(shown.times), self._placed(shown.poses)
         if not self._is_aimed:
             self._is_aimed = True
             self._rr.send_blueprint(_blueprint(placed[0], self._look.cameras, self._live), make_default=True)
-        frames = [_frame(world, link) for world in range(poses.shape[1]) for link in self._look.links]
-        middle = np.zeros((len(times), 1, 7))
+        frames = [_frame(world, link) for world in range(placed.shape[1]) for link in self._look.links]
+        middle = np.zeros((count, 1, 7))
         middle[:, 0, :3], middle[:, 0, 6] = placed[..., :3].mean((1, 2)), 1.0
         frames.append(_MIDDLE)
-        rows = np.concatenate([placed.reshape(len(times), -1, 7), middle], 1).reshape(-1, 7)
+        rows = np.concatenate([placed.reshape(count, -1, 7), middle], 1).reshape(-1, 7)
         columns = rr.Transform3D.columns(
             translation=rows[:, :3],
             quaternion=rows[:, 3:],
-            child_frame=frames * len(times),
+            child_frame=frames * count,
             parent_frame=[_ROOT] * len(rows),
         )
-        self._rr.send_columns("tf", _index(times, steps, iteration, len(frames)), columns)
-        self._terms.append((times, steps, rewards, iteration))
-        if sum(len(each[0]) for each in self._terms) >= _TERMS:
+        self._rr.send_columns("tf", _index(shown.times, shown.steps, shown.iteration, len(frames)), columns)
+        self._pending.append(shown)
+        if sum(len(each.times) for each in self._pending) >= _TERMS:
             self._send_terms()
-
-    def images(
-        self,
-        camera: str,
-        times: np.ndarray,
-        steps: np.ndarray,
-        seen: Sequence[np.ndarray],
-        iteration: int | None = None,
-    ) -> None:
-        """Show what a camera saw in all worlds, as one image of tiles.
-
-        Args:
-            camera: One of the look's.
-            times: [ns since 1970], shape ``(steps,)``.
-            steps: Their numbers.
-            seen: Of each step: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
-            iteration: Of the training, where there is one.
-        """
-        if not len(times):
-            return
-        columns = rr.EncodedImage.columns(
-            blob=[png(tiled(each, math.ceil(math.sqrt(len(each))), ground=0)) for each in seen],
-            media_type=["image/png"] * len(seen),
-        )
-        self._rr.send_columns(f"images/{camera}", _index(times, steps, iteration), columns)
+        for camera, images in shown.images.items():
+            if places := list(images):
+                # what a camera saw in all worlds, as one image of tiles
+                blobs = [png(tiled(each, math.ceil(math.sqrt(len(each))), ground=0)) for each in images.values()]
+                tiles = rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
+                index = _index(shown.times[places], shown.steps[places], shown.iteration)
+                self._rr.send_columns(f"images/{camera}", index, tiles)
+        self.log(shown.log)
+        self.curve("episodes", [value for _, value in shown.returns], np.array([at for at, _ in shown.returns]), [])
 
     def _send_terms(self) -> None:
         """Several steps at once: each chunk that is sent costs the browser about the same, whatever is in it."""
-        pending, self._terms = self._terms, []
-        if not self._look.terms or not pending:
-            return
-        times, steps, rewards = (np.concatenate([each[part] for each in pending]) for part in range(3))
-        columns = rr.Scalars.columns(scalars=rewards.astype(np.float64).reshape(-1))
-        self._rr.send_columns(
-            "terms", _index(times, steps, pending[-1][3]), columns.partition([len(self._look.terms)] * len(times))
-        )
+        pending, self._pending = self._pending, []
+        if self._look.terms and pending:
+            times, steps = (np.concatenate([getattr(each, name) for each in pending]) for name in ("times", "steps"))
+            rewards = np.concatenate([each.rewards for each in pending]).astype(np.float64)
+            columns = rr.Scalars.columns(scalars=rewards.reshape(-1)).partition([len(self._look.terms)] * len(times))
+            self._rr.send_columns("terms", _index(times, steps, pending[-1].iteration), columns)
 
     def curve(self, name: str, values: Sequence[float], times: np.ndarray | None, iterations: Sequence[int]) -> None:
         """Add points to a curve of returns, at times [ns], where they belong on that timeline, and at iterations, if any."""

@@ -37,10 +37,7 @@ def shown(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> dict[
     (part,) = replay.parts()
     file = tmp_path_factory.mktemp("shown") / "two.rrd"
     screen = Screen(file, "two", replay.look, live=False)
-    screen.frames(part.times, part.steps, part.poses, part.rewards)
-    screen.images("eye", *part.pictures("eye"))
-    screen.log(part.log)
-    screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
+    screen.show(part)
     screen.close()
     found: dict[str, Any] = {}
     for chunk in RrdReader(file).stream().to_chunks():
