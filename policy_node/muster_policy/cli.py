@@ -9,7 +9,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from muster_policy import __version__
 from muster_policy.bundle import Bundle, open_bundle
@@ -35,15 +35,16 @@ episode when std_msgs/Empty arrives on ~/reset. docs/policy-node.md says more.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit status: 0 after a clean end, 1 for a mismatch, 2 for wrong use."""
-    options = parser().parse_args(arguments)
+    settings = parser().parse_args(arguments, Settings())
     try:
-        bundle = open_bundle(options.bundle)
+        bundle = open_bundle(settings.bundle)
         policy = Policy(bundle)
         greatest = policy.self_test(bundle.parity)
         _say(f"{bundle.contract.task} of {bundle.origin}: self-test passed, actions differ by {greatest:.1e} at most")
-        node = PolicyNode(bundle, _settings(options, bundle), policy, _say)
+        _complete(settings, bundle)
+        node = PolicyNode(bundle, settings, policy, _say)
         _introduce(node, bundle)
-        if options.check:
+        if settings.check:
             return 0
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: node.stopping.set())
@@ -96,11 +97,13 @@ def parser() -> argparse.ArgumentParser:
     )
     add(
         "--joints",
+        dest="joints_file",
         type=Path,
         metavar="FILE",
         help="lines `policy_joint = robot_joint`, for joints with other names on the robot",
     )
-    add("--remap", action="append", default=[], metavar="TOPIC:=NAME", help="use another topic; may be repeated")
+    repeated: dict[str, Any] = {"action": "append", "default": [], "dest": "remappings"}
+    add("--remap", **repeated, metavar="TOPIC:=NAME", help="use another topic; may be repeated")
     add("--controller", metavar="NAME", help="also publish std_msgs/Float64MultiArray on NAME/commands")
     add("--strict-limits", action="store_true", help="keep position targets within the joints' ranges")
     add("--domain", type=_whole, default=None, metavar="ID", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
@@ -118,33 +121,26 @@ def parser() -> argparse.ArgumentParser:
     return found
 
 
-def _settings(options: argparse.Namespace, bundle: Bundle) -> Settings:
-    names = [action.name for action in bundle.contract.actions if action.kind != "choice"]
-    names += [target.joint for action in bundle.contract.actions for target in action.targets]
-    for group in bundle.contract.groups:
-        names += [name for term in group.terms if term.element == "joint" for name in term.elements]
+def _complete(settings: Settings, bundle: Bundle) -> None:
+    """Check names, and fill in what depends on other options, the environment or the bundle. Raises Refused."""
     remap = {}
-    for each in options.remap:
+    for each in settings.remappings:
         topic, sign, name = each.partition(":=")
         if not (topic and sign and name):
             raise Refused(f"--remap {each}: expected TOPIC:=NAME, such as imu:=/imu/data")
         remap[topic] = _ros_name("--remap", name)
-    return Settings(
-        rate=options.rate,
-        trigger=options.trigger,
-        timeout=options.timeout,
-        strict=options.strict_limits,
-        controller=options.controller and _ros_name("--controller", options.controller),
-        joints=read_joints(options.joints, names) if options.joints else {},
-        remap=remap,
-        distribution=options.distro,
-        domain=_domain(options.domain),
-        connect=options.connect or (None if options.listen else "tcp/localhost:7447"),
-        listen=options.listen,
-        namespace=_ros_name("--namespace", options.namespace) if options.namespace.strip("/") else "/",
-        name=_ros_name("--name", options.name),
-        duration=options.duration,
-    )
+    settings.remap = remap
+    settings.controller = settings.controller and _ros_name("--controller", settings.controller)
+    settings.joints = read_joints(settings.joints_file, bundle.contract.joints) if settings.joints_file else {}
+    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if settings.domain is None and not text.isdigit():
+        raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
+    settings.domain = int(text) if settings.domain is None else settings.domain
+    if not 0 <= settings.domain <= 232:
+        raise Refused(f"domain {settings.domain}: expected 0 to 232")
+    settings.connect = settings.connect or (None if settings.listen else "tcp/localhost:7447")
+    settings.namespace = _ros_name("--namespace", settings.namespace) if settings.namespace.strip("/") else "/"
+    settings.name = _ros_name("--name", settings.name)
 
 
 def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
@@ -207,16 +203,6 @@ def _ros_name(option: str, text: str) -> str:
     if option == "--name" and "/" in text:
         raise Refused(f"--name {text}: a node's name has no slash; give --namespace besides")
     return text
-
-
-def _domain(option: int | None) -> int:
-    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if option is None and not text.isdigit():
-        raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
-    domain = int(text) if option is None else option
-    if not 0 <= domain <= 232:
-        raise Refused(f"domain {domain}: expected 0 to 232")
-    return domain
 
 
 def _positive(text: str) -> float:

@@ -147,6 +147,15 @@ class Contract:
     states: tuple[State, ...]
     discrete: bool
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints that the policy reads or drives."""
+        names = [action.name for action in self.actions if action.kind != "choice"]
+        names += [target.joint for action in self.actions for target in action.targets]
+        for group in self.groups:
+            names += [joint for term in group.terms if term.element == "joint" for joint in term.elements]
+        return tuple(dict.fromkeys(names))
+
     def command(self, name: str) -> Command | None:
         """The command of that name."""
         return next((command for command in self.commands if command.name == name), None)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
 import gc
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from muster_policy.actions import Command, Commands
 from muster_policy.bundle import Bundle
@@ -39,41 +40,27 @@ class _Report:
     stops: int = 0
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the node.
+class Settings(argparse.Namespace):
+    """Settings of the node: the options of the command, ``muster-policy --help``."""
 
-    Attributes:
-        rate: Control steps per second; None: as in training.
-        trigger: ``timer``: at the rate, by the clock; ``joint_states``: when a joint state arrives, at most at the rate.
-        timeout: Age from which a measurement is too old [s]; None: three control steps, at least 20 ms.
-        strict: Keep position targets within the joints' ranges.
-        controller: Also publish to this ros2_control controller.
-        joints: Name of a joint on the robot by its name in the contract, if it differs.
-        remap: Replacement topics by the node's topics.
-        distribution: Of ROS 2.
-        domain: ROS domain.
-        connect: Endpoint of a router; None: none.
-        listen: Be a router on this endpoint.
-        namespace: Of the node.
-        name: Of the node.
-        duration: Time after which it ends by itself [s]; None: never.
-    """
-
-    rate: float | None = None
-    trigger: str = "timer"
-    timeout: float | None = None
-    strict: bool = False
-    controller: str | None = None
-    joints: Mapping[str, str] = field(default_factory=dict)
-    remap: Mapping[str, str] = field(default_factory=dict)
-    distribution: str = "jazzy"
-    domain: int = 0
-    connect: str | None = "tcp/localhost:7447"
-    listen: str | None = None
-    namespace: str = "/"
-    name: str = "muster_policy"
-    duration: float | None = None
+    rate: float | None
+    """Control steps per second; None: as in training."""
+    trigger: str
+    timeout: float | None
+    """Age from which a measurement is too old [s]; None: three control steps, at least 20 ms."""
+    strict_limits: bool
+    controller: str | None
+    joints: Mapping[str, str]
+    """Name of a joint on the robot by its name in the contract, if it differs."""
+    remap: Mapping[str, str]
+    """Replacement topics by the node's topics."""
+    distro: str
+    domain: int
+    connect: str | None
+    listen: str | None
+    namespace: str
+    name: str
+    duration: float | None
 
 
 class PolicyNode:
@@ -93,9 +80,9 @@ class PolicyNode:
         self.settings, self._tell, self._print = settings, tell, tell
         contract = bundle.contract
         self.rate = settings.rate or contract.control_hz
-        self.messages = Messages(settings.distribution)
+        self.messages = Messages(settings.distro)
         self.observations = Observations(contract)
-        self.commands = Commands(contract, settings.joints, settings.strict)
+        self.commands = Commands(contract, settings.joints, settings.strict_limits)
         if settings.controller and len(self.commands.kinds) > 1:
             raise Refused(
                 f"--controller {settings.controller}: the policy commands {' and '.join(self.commands.kinds)}, a "

@@ -203,11 +203,7 @@ class Observations:
 
     def __init__(self, contract: Contract) -> None:
         self._contract = contract
-        names = [action.name for action in contract.actions if action.kind != "choice"]
-        names += [target.joint for action in contract.actions for target in action.targets]
-        for group in contract.groups:
-            names += [joint for term in group.terms if term.element == "joint" for joint in term.elements]
-        self.joints = tuple(dict.fromkeys(names))
+        self.joints = contract.joints
         self.needs: set[str] = {JOINTS}
         self.quantities: set[str] = set()
         self.commands: dict[str, Command] = {}

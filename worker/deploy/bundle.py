@@ -27,7 +27,6 @@ import shutil
 import time
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -69,18 +68,6 @@ PACKAGES = ("torch", "onnx", "onnxruntime", "newton", "warp-lang", "rsl-rl-lib")
 """Whose versions the manifest has."""
 
 
-@dataclass(frozen=True)
-class Files:
-    """A policy's files in memory, compared with the policy."""
-
-    onnx: bytes
-    torchscript: bytes
-    parity: bytes
-    """``parity.npz``."""
-    report: dict[str, Any]
-    """Method and result of the comparison."""
-
-
 def bundle_files(
     policy: Policy,
     exported: ExportedPolicy,
@@ -88,8 +75,8 @@ def bundle_files(
     algorithm: str,
     recordings: Mapping[str, parity.RecordedObservations],
     run_path: str = "",
-) -> Files:
-    """Write a policy to files and compare them with it on the recordings, and on the policy's own sample.
+) -> tuple[dict[str, bytes], dict[str, Any]]:
+    """The files of a policy by name, compared with it on the recordings and on the policy's own sample; and the result of the comparison.
 
     Args:
         policy: As it was trained, on the CPU.
@@ -131,7 +118,7 @@ def bundle_files(
     }
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
-    return Files(onnx, torchscript, buffer.getvalue(), report)
+    return {"policy.onnx": onnx, "policy.pt": torchscript, "parity.npz": buffer.getvalue()}, report
 
 
 def export(
@@ -170,14 +157,14 @@ def export(
     if extremes and rounds:
         recordings["extremes"] = parity.single(extremes.inputs())
     run_path = f"{run.name}/{checkpoint.name}"
-    files = bundle_files(policy, exported, contract, checkpoint.manifest["algorithm"], recordings, run_path)
-    report: dict[str, Any] = {"parity": files.report, "judged": None}
+    files, compared = bundle_files(policy, exported, contract, checkpoint.manifest["algorithm"], recordings, run_path)
+    report: dict[str, Any] = {"parity": compared, "judged": None, "changed_robot": changes or None}
     if trained:
         task.load_state_dict(begin)  # the same worlds, and the same random numbers from there on
-        played = parity.play(task, OnnxPolicy(files.onnx, contract), rounds)
+        played = parity.play(task, OnnxPolicy(files["policy.onnx"], contract), rounds)
         runtime = f"onnxruntime {metadata.version('onnxruntime')}"
         report["judged"] = {"runtime": runtime, **parity.judge(trained, played)}
-    return _publish(run, checkpoint, task, contract, files, documents, {**report, "changed_robot": changes or None})
+    return _publish(run, checkpoint, task, contract, files, documents, report)
 
 
 def _publish(
@@ -185,7 +172,7 @@ def _publish(
     checkpoint: Checkpoint,
     task: Task,
     contract: Contract,
-    files: Files,
+    files: Mapping[str, bytes],
     documents: Mapping[str, Mapping[str, Any]],
     report: Mapping[str, Any],
 ) -> Path:
@@ -194,14 +181,11 @@ def _publish(
     facts = checkpoint.manifest
     try:
         hidden.mkdir(parents=True)
-        (hidden / "policy.onnx").write_bytes(files.onnx)
-        (hidden / "policy.pt").write_bytes(files.torchscript)
-        (hidden / "parity.npz").write_bytes(files.parity)
-        write_json(hidden / CONTRACT, contract.document())
-        write_json(hidden / REPORT, report)
-        (hidden / LEAPP).write_text(leapp_description(files.onnx, contract))
+        for name, data in files.items():
+            (hidden / name).write_bytes(data)
+        (hidden / LEAPP).write_text(leapp_description(files["policy.onnx"], contract))
         robot = add_robot(task, hidden)
-        for name, document in documents.items():
+        for name, document in {CONTRACT: contract.document(), REPORT: report, **documents}.items():
             write_json(hidden / name, document)
         (hidden / "README.md").write_text(_readme(run, checkpoint, contract, robot, list(documents)))
         source = inspect.getsourcefile(type(task))
@@ -327,25 +311,22 @@ def add_robot(task: Task, bundle: Path) -> dict[str, Any] | None:
     declare = getattr(task, "robot", None)
     if declare is None:
         return None
-    robot = declare(task.config)
-    text = str(robot.file)
+    text = str(declare(task.config).file)
     found = robot_files.read(text)
+    path = Path(found.source)
     if text.lstrip().startswith("<"):
         name = f"robot.{'xml' if found.format == 'mjcf' else found.format}"
-        _write(bundle / "robot" / name, text.encode())
-        return {
-            "source": "the task's own source",
-            "format": found.format,
-            "licence": "the task's",
-            "file": f"robot/{name}",
-        }
-    path = Path(found.source)
-    if path.parent == _OWN:
-        _write(bundle / "robot" / path.name, path.read_bytes())
-        return {"source": path.name, "format": found.format, "licence": "Apache-2.0", "file": f"robot/{path.name}"}
-    scheme, _, inside = text.partition(":")
-    package = {"package": inside.partition("/")[0], "newton": "newton"}.get(scheme)
-    return {"source": text, "format": found.format, **_package(package), "file": None}
+        source, licence, data = "the task's own source", "the task's", text.encode()
+    elif path.parent == _OWN:
+        name = source = path.name
+        licence, data = "Apache-2.0", path.read_bytes()
+    else:
+        scheme, _, inside = text.partition(":")
+        package = {"package": inside.partition("/")[0], "newton": "newton"}.get(scheme)
+        return {"source": text, "format": found.format, **_package(package), "file": None}
+    (bundle / "robot").mkdir(exist_ok=True)
+    (bundle / "robot" / name).write_bytes(data)
+    return {"source": source, "format": found.format, "licence": licence, "file": f"robot/{name}"}
 
 
 def _package(name: str | None) -> dict[str, str]:
@@ -355,11 +336,6 @@ def _package(name: str | None) -> dict[str, str]:
         about = metadata.metadata(name)
     except metadata.PackageNotFoundError:
         return {"package": name, "licence": "not known"}
-    named = (about[key] for key in ("License-Expression", "License") if key in about)
-    licence = next(filter(None, named), "not known")
+    licences = (about[key] for key in ("License-Expression", "License") if key in about)
+    licence = next(filter(None, licences), "not known")
     return {"package": f"{name} {about['Version']}", "licence": f"{licence.splitlines()[0]} (of the package)"}
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(data)
