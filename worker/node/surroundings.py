@@ -7,18 +7,19 @@ variables those only that say where things are: language, time zone, proxies, ce
 
 from __future__ import annotations
 
+import contextlib
 import errno
+import fcntl
 import ipaddress
 import os
 import pwd
 import shutil
 import socket
+import struct
 import sys
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
-
-import psutil
 
 from shared_store.contract.node import NodeContract, job_variables, rank_variables
 from shared_store.process.memory_groups import killed_for_memory, make_memory_group
@@ -32,6 +33,7 @@ _KEPT = (
     *("GIT_SSL_CAINFO", "NODE_EXTRA_CA_CERTS"),
 )
 _KEPT_PREFIXES = ("LC_", "CUDA_", "NVIDIA_", "NCCL_", "GLOO_")
+_SIOCGIFADDR = 0x8915
 KEEP = "MUSTER_KEEP_DIRECTORY"
 """A job that sets this variable to 1 keeps its directories when the attempt is over."""
 
@@ -126,8 +128,13 @@ def interface_of(address: str | None, peer: str) -> str | None:
         return None
     if found.is_loopback:
         return "lo"  # the whole of 127.0.0.0/8 is on it
-    interfaces = psutil.net_if_addrs().items()
-    return next((name for name, held in interfaces if any(each.address == str(found) for each in held)), None)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        for _, name in socket.if_nameindex():
+            with contextlib.suppress(OSError):  # it has no IPv4 address
+                held = fcntl.ioctl(probe.fileno(), _SIOCGIFADDR, struct.pack("256s", name.encode()[:15]))[20:24]
+                if held == found.packed:
+                    return name
+    return None
 
 
 def address_towards(peer: str) -> str:

@@ -314,24 +314,23 @@ class LiveTap(Hook):
         reader = TapReader(self._tap)
         reader.next = int(self._tap.count)
         segment = Segment.create(self._tap.layout)
-        self._respond(path=str(segment.path), layout=asdict(self._tap.layout), note=self._tap.left_out)
         most, pause = (1, NEWEST_SECONDS) if request.get("newest") is True else (None, DRAIN_SECONDS)
         polled, ended = time.monotonic(), False
-        while not ended:
-            ended = self._closing.wait(pause)
-            self._gate.wait()
-            if len(rows := reader.take(most)):
-                segment.append(rows)
-            if time.monotonic() - polled >= POLL_SECONDS:
-                polled = time.monotonic()
-                ended = ended or not is_alive(request["host"], request["process"])
-        segment.close()
+        try:
+            self._respond(path=str(segment.path), layout=asdict(self._tap.layout), note=self._tap.left_out)
+            while not ended:
+                ended = self._closing.wait(pause)
+                self._gate.wait()
+                if len(rows := reader.take(most)):
+                    segment.append(rows)
+                if time.monotonic() - polled >= POLL_SECONDS:
+                    polled = time.monotonic()
+                    ended = ended or not is_alive(request["host"], request["process"])
+        finally:
+            segment.close()
         response_of(self._run).unlink(missing_ok=True)
         newest = read_json(request_of(self._run)) or {}
-        if (newest.get("host"), newest.get("process")) == (
-            request["host"],
-            request["process"],
-        ):  # else it is the next reader's
+        if all(newest.get(key) == request[key] for key in ("host", "process")):  # else it is the next reader's
             request_of(self._run).unlink(missing_ok=True)
 
     def _respond(self, **response: Any) -> None:
