@@ -169,14 +169,6 @@ class Inputs:
         ages = [(each, now - each.arrived) for each in self.all if each.command is None]
         return [(each, age) for each, age in ages if age > timeout]
 
-    def too_slow(self, now: float) -> list[Input]:
-        """Commanded velocities that the policy would exceed."""
-        return [each for each in self.all if each.is_too_slow(now)]
-
-    def silent_commands(self, now: float) -> list[Input]:
-        """Commanded velocities that are too old to count."""
-        return [each for each in self.all if each.is_silent(now)]
-
     def snapshot(self, now: float) -> Snapshot:
         """The current inputs; none may be missing. A commanded velocity that is too old is 0."""
         values = {each.topic: each.value for each in self.all}

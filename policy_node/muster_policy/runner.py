@@ -95,7 +95,7 @@ class Runner:
             if self.counts.stops:
                 self._settled = now + SETTLED
             return False
-        if slow := self.inputs.too_slow(now):
+        if slow := [each for each in self.inputs.all if each.is_too_slow(now)]:
             if self.mode is Mode.ACTING:
                 why = f"{self._topic(slow[0].topic)} asks for less than any command in training"
                 self._stop(why, "when that ends")
@@ -124,7 +124,7 @@ class Runner:
         self.mode = Mode.ENDED
 
     def _act(self, now: float) -> bool:
-        silent = {each.topic for each in self.inputs.silent_commands(now)}
+        silent = {each.topic for each in self.inputs.all if each.is_silent(now)}
         for topic in sorted(silent - self._silent):
             self._say(f"{self._topic(topic)} is silent: the command is velocity 0", True)
         self._silent = silent
