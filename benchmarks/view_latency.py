@@ -102,7 +102,7 @@ class Timed(TrainingView):
 
     read = 0
 
-    def _newest(self, shown: screen.Screen | None) -> Rows | None:
+    def _newest(self, shown: screen.Screen) -> Rows | None:
         rows = super()._newest(shown)
         Timed.read = time.time_ns()
         return rows
@@ -114,13 +114,13 @@ class Marked(screen.Screen):
     frames_sent: dict[str, tuple[int, int, int]] = {}
     """By word: number of the step, when its row was read, when the frame was handed to Rerun [ns]."""
 
-    def frames(self, times: np.ndarray, steps: np.ndarray, *rest: Any) -> None:
+    def show(self, shown: screen.Steps) -> None:
         read = Timed.read
-        super().frames(times, steps, *rest)
+        super().show(shown)
         word = "".join(random.choices(string.ascii_letters, k=12))
-        index = [rr.TimeColumn("time", timestamp=times.astype("datetime64[ns]"))]
+        index = [rr.TimeColumn("time", timestamp=shown.times.astype("datetime64[ns]"))]
         self._rr.send_columns("mark", index, rr.TextLog.columns(text=[f"MARK{word}"]))
-        self.frames_sent[word] = int(steps[-1]), read, time.time_ns()
+        self.frames_sent[word] = int(shown.steps[-1]), read, time.time_ns()
 
 
 def look_on(url: str, seconds: float, stop: list[int], found: dict[str, Any]) -> None:

@@ -68,10 +68,14 @@ def describe(file: str, reading: Reading) -> dict[str, Any]:
 
 def _joint(builder: newton.ModelBuilder, view: RobotView, joint: int) -> dict[str, Any]:
     dof = view.dofs[joint]
-    lower, upper = (limit if math.isfinite(limit) else None for limit in view.ranges[joint])
+    whole = joint_of(builder, dof)
+    is_linear = dof - builder.joint_qd_start[whole] < builder.joint_dof_dim[whole][0]
+    lower, upper, effort = (
+        limit if math.isfinite(limit) else None for limit in (*view.ranges[joint], view.efforts[joint])
+    )
     return {
         "name": view.joint_names[joint],
-        "kind": "slide" if _is_linear(builder, dof) else "hinge",
+        "kind": "slide" if is_linear else "hinge",
         "lower": lower,
         "upper": upper,
         "default": view.defaults[joint],
@@ -79,22 +83,15 @@ def _joint(builder: newton.ModelBuilder, view: RobotView, joint: int) -> dict[st
         "damping": builder.joint_damping[dof],
         "armature": builder.joint_armature[dof],
         "friction_loss": builder.joint_friction[dof],
-        "effort_limit": view.efforts[joint] if math.isfinite(view.efforts[joint]) else None,
+        "effort_limit": effort,
     }
-
-
-def _is_linear(builder: newton.ModelBuilder, dof: int) -> bool:
-    joint = joint_of(builder, dof)
-    return dof - builder.joint_qd_start[joint] < builder.joint_dof_dim[joint][0]
 
 
 def _balls(model: Any) -> list[dict[str, Any]]:
     """Joints of three degrees of freedom, which have no position that a number could say; none of a USD file."""
-    joints = range(model.njnt) if model else ()
-    nothing = dict.fromkeys(("lower", "upper", "default", "effort_limit"))
     return [
         {
-            **nothing,
+            **dict.fromkeys(("lower", "upper", "default", "effort_limit")),
             "name": name_of(model, kind_of("joint"), joint),
             "kind": "ball",
             "stiffness": float(model.jnt_stiffness[joint]),
@@ -102,27 +99,24 @@ def _balls(model: Any) -> list[dict[str, Any]]:
             "armature": float(model.dof_armature[model.jnt_dofadr[joint]]),
             "friction_loss": float(model.dof_frictionloss[model.jnt_dofadr[joint]]),
         }
-        for joint in joints
+        for joint in (range(model.njnt) if model else ())
         if model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_BALL
     ]
 
 
 def _tendons(model: Any) -> list[dict[str, Any]]:
     """The tendons of a compiled model; none of a USD file."""
-    found = []
-    for tendon in range(model.ntendon) if model else ():
-        lower, upper = model.tendon_range[tendon] if model.tendon_limited[tendon] else (None, None)
-        found.append(
-            {
-                "name": name_of(model, kind_of("tendon"), tendon),
-                "connects": _named(model, tendon_ends(model, tendon)),
-                "lower": None if lower is None else float(lower),
-                "upper": None if upper is None else float(upper),
-                "stiffness": float(model.tendon_stiffness[tendon]),
-                "damping": float(model.tendon_damping[tendon]),
-            }
-        )
-    return found
+    return [
+        {
+            "name": name_of(model, kind_of("tendon"), tendon),
+            "connects": _named(model, tendon_ends(model, tendon)),
+            "lower": float(model.tendon_range[tendon, 0]) if model.tendon_limited[tendon] else None,
+            "upper": float(model.tendon_range[tendon, 1]) if model.tendon_limited[tendon] else None,
+            "stiffness": float(model.tendon_stiffness[tendon]),
+            "damping": float(model.tendon_damping[tendon]),
+        }
+        for tendon in (range(model.ntendon) if model else ())
+    ]
 
 
 def _equalities(model: Any) -> list[dict[str, Any]]:
@@ -206,23 +200,18 @@ def _actuator(
     None stands for what such an actuator has not: a damper's force is ``-damping input velocity``, a muscle's depends on its length.
     """
     kind, numbers = word_of(mujoco.mjtGain, gain[0]), gain[1]
-    biases = [0.0] * 3 if bias[0] == mujoco.mjtBias.mjBIAS_NONE else [float(each) for each in bias[1][:3]]
-    if kind == "affine":
-        described = {
-            "gain": float(numbers[0]),
-            "bias": biases,
-            "stiffness": -float(numbers[1]),
-            "damping": -float(numbers[2]),
-        }
-    elif kind == "fixed":
-        described = {"gain": float(numbers[0]), "bias": biases, "stiffness": -biases[1], "damping": -biases[2]}
-    else:
-        described = dict.fromkeys(("gain", "bias", "stiffness", "damping"))
+    law: dict[str, Any] = dict.fromkeys(("gain", "bias", "stiffness", "damping"))
+    if kind in ("affine", "fixed"):
+        biases = [0.0] * 3 if bias[0] == mujoco.mjtBias.mjBIAS_NONE else [float(each) for each in bias[1][:3]]
+        forces = [float(each) for each in numbers[:3]] if kind == "affine" else biases
+        # without the sign of a zero
+        law = {"gain": float(numbers[0]) or 0.0, "bias": biases}
+        law |= {"stiffness": -forces[1] or 0.0, "damping": -forces[2] or 0.0}
     return {
         "name": name,
         "drives": target,
         "gear": float(gear[0]),
-        **{word: number or 0.0 if isinstance(number, float) else number for word, number in described.items()},
+        **law,
         "law": kind,
         "dynamics": dynamics,
         **{f"{word}_range": None if pair is None else [float(each) for each in pair] for word, pair in limits.items()},

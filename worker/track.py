@@ -30,8 +30,8 @@ from shared_store.volume.layout import Run
 from shared_store.volume.metrics import MetricsHistory
 from worker.telemetry.services import SERVICES, Service, ServiceRefused, Tracked, TrainingEnd, one_line, without_key
 
-LOOK_SECONDS = 2.0
-"""Between two looks at the metrics."""
+POLL_SECONDS = 2.0
+"""Between two polls of the metrics."""
 _PATIENCE = (5.0, 300.0)
 """Seconds until what a service did not take is tried again: at first, and at most."""
 _MOST = 500
@@ -42,7 +42,7 @@ _NICE = 10
 Say = Callable[[str], None]
 
 
-class Turn:
+class SenderLock:
     """The right to send a run to a service, which one process has at a time; the kernel takes it back when the process dies.
 
     Args:
@@ -55,7 +55,7 @@ class Turn:
         self._file: int | None = None
 
     def take(self) -> str | None:
-        """Take it, unless it is taken already; returns who else has it, None for nobody. Raises OSError."""
+        """Take it, unless it is taken already; returns the process that has it, None for this one. Raises OSError."""
         if self._file is not None:
             return None
         self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -90,8 +90,8 @@ class Sender:
         self._note = run.tracking / f"{kind}.json"
         self._history = MetricsHistory(run)
         self._sent: int | None = None
-        self._trouble = False
         self._tries = 0
+        """Without success, since the last one."""
         self._next = 0.0
 
     def open(self, resumed_from: int | None, epoch: int) -> None:
@@ -123,17 +123,16 @@ class Sender:
             while records := self._history.after(self._sent, _MOST):
                 self._service.send(records)
                 self._sent = records[-1]["iteration"]
-            if self._trouble:
+            if self._tries:
                 self._say("it answers again; everything is sent")
-            self._trouble, self._tries = False, 0
+            self._tries = 0
             return not self._history.behind
         except Exception as error:  # of the network, of the service's library, of the volume: all may pass
             first, most = _PATIENCE
             self._next = time.monotonic() + min(most, first * 2**self._tries)
-            self._tries = min(self._tries + 1, 10)
-            if not self._trouble:
+            if not self._tries:
                 self._say(f"warning: nothing can be sent now ({one_line(error)})")
-            self._trouble = True
+            self._tries = min(self._tries + 1, 10)
             return False
 
     def finish(self, outcome: str) -> None:
@@ -163,16 +162,11 @@ def tracked_of(run: Run, train: Mapping[str, Any], facts: Mapping[str, Any]) -> 
         with contextlib.suppress(PackageNotFoundError):
             versions[name] = version(name)
     config: dict[str, Any] = {"train": dict(train), "run": run.name, **facts, "versions": versions}
-    if commit := _commit():
-        config["git_commit"] = commit
-    return Tracked(run.name, str(train.get("task", "")).rpartition(":")[2], config, run.tracking)
-
-
-def _commit() -> str | None:
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        asked = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
-        return asked.stdout.strip() or None
-    return None
+        done = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, timeout=5)
+        if commit := done.stdout.strip():
+            config["git_commit"] = commit
+    return Tracked(run.name, str(train.get("task", "")).rpartition(":")[2], config, run.tracking)
 
 
 def same_iterations(train: Mapping[str, Any]) -> dict[str, Any]:
@@ -182,63 +176,59 @@ def same_iterations(train: Mapping[str, Any]) -> dict[str, Any]:
 
 def beside_a_rank() -> None:
     """Carry out the order of a main rank."""
-    answers = _own_output()
+    output = _own_output()
     order = json.loads(sys.stdin.buffer.readline() or b"null")
     if order is None:
         return
     os.nice(_NICE)
 
-    def tell(**words: Any) -> None:
-        with contextlib.suppress(OSError):  # the rank is gone
-            os.write(answers, json.dumps(words).encode() + b"\n")
+    def report(**words: Any) -> None:
+        with contextlib.suppress(OSError):  # the rank has ended
+            os.write(output, json.dumps(words).encode() + b"\n")
 
-    run, epoch, train = Run(Path(order["run"])), order["epoch"], order["train"]
-    service = SERVICES[order["service"]](tracked_of(run, train, order["facts"]), order["settings"])
+    def say(text: str) -> None:
+        report(said=text)
+
+    run, epoch, train, kind = Run(Path(order["run"])), order["epoch"], order["train"], order["service"]
+    service = SERVICES[kind](tracked_of(run, train, order["facts"]), order["settings"])
     try:
         service.prepare()
     except ServiceRefused as refused:
-        tell(refused=str(refused))
+        report(refused=str(refused))
         return
-    tell(ready=True)
-    sender = Sender(run, service, order["service"], same_iterations(train), lambda text: tell(said=text))
-    turn, waits_for = Turn(run, order["service"]), None
+    report(ready=True)
+    sender, lock, waits_for = Sender(run, service, kind, same_iterations(train), say), SenderLock(run, kind), None
     resumed_from, ending = None, None
     while ending is None:
-        if select.select([0], [], [], LOOK_SECONDS)[0]:
+        if select.select([0], [], [], POLL_SECONDS)[0]:
             ending = json.loads(sys.stdin.buffer.readline() or b'{"end": "failed"}')
         try:
             check_epoch(run, epoch)
             resumed_from = _resumed_from(run, epoch) if resumed_from is None else resumed_from
             if resumed_from is None:  # this attempt has not begun to train
                 continue
-            other = turn.take()
+            other = lock.take()
             if other is None:
                 sender.step(resumed_from, epoch)
             elif other != waits_for:
-                tell(said=f"{other} sends this run; what is new is sent after it")
+                say(f"{other} sends this run; what is new is sent after it")
             waits_for = other
         except StaleEpoch:
             return
-        except (OSError, ValueError):  # the volume is away
+        except (OSError, ValueError):  # the volume can't be reached
             continue
-    if resumed_from is None:
-        tell(done=True)
-    elif _is_ours(turn) and sender.step(resumed_from, epoch, at_once=True):
-        try:
+    try:
+        if resumed_from is None:
+            report(done=True)
+        elif lock.take() is None and sender.step(resumed_from, epoch, at_once=True):
             sender.finish(ending["end"])
-            tell(done=True)
-        except Exception as error:
-            tell(said=f"warning: its end could not be sent ({one_line(error)})")
-
-
-def _is_ours(turn: Turn) -> bool:
-    with contextlib.suppress(OSError):  # the volume is away
-        return turn.take() is None
-    return False
+            report(done=True)
+    except Exception as error:
+        say(f"warning: its end could not be sent ({one_line(error)})")
 
 
 def _resumed_from(run: Run, epoch: int) -> int | None:
-    """From which iteration the attempt went on; None before it has said so, which is before its first one."""
+    """The iteration from which the attempt went on; None before it has written that, which is before its first one."""
     with contextlib.suppress(FileNotFoundError), open(run.metrics / f"metrics-e{epoch}.jsonl", "rb") as file:
         line = file.readline()
         if line.endswith(b"\n"):
@@ -248,12 +238,12 @@ def _resumed_from(run: Run, epoch: int) -> int | None:
 
 def _own_output() -> int:
     """A descriptor of standard output for this module alone: what libraries print goes nowhere, and none finds a terminal to ask at."""
-    answers = os.dup(1)
+    output = os.dup(1)
     nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
+    for standard in (1, 2):
+        os.dup2(nowhere, standard)
     os.close(nowhere)
-    return answers
+    return output
 
 
 def afterwards(directory: str, kind: str) -> int:
@@ -265,22 +255,18 @@ def afterwards(directory: str, kind: str) -> int:
         return _fail(f"{run.path} is no run that a `train` job made; name a directory of runs/ in the store")
     if kind not in SERVICES:
         return _fail(f"no service is called {kind}; there are: {', '.join(SERVICES)}")
-    settings = (spec.get("track") or {}).get(kind) or {}
-    service = SERVICES[kind](tracked_of(run, spec["train"], {}), settings)
+    service = SERVICES[kind](tracked_of(run, spec["train"], {}), (spec.get("track") or {}).get(kind) or {})
     try:
         service.prepare()
+        other = SenderLock(run, kind).take()
     except ServiceRefused as refused:
         return _fail(f"{kind}: {refused}")
-    turn = Turn(run, kind)
-    try:
-        other = turn.take()
     except OSError as error:
         return _fail(f"{kind}: {run.tracking} can't be written ({error.strerror})")
     if other is not None:
         return _fail(f"{kind}: {other} sends this run already; run this again once its training is over")
-    sender = Sender(
-        run, service, kind, same_iterations(spec["train"]), lambda text: print(f"{kind}: {text}", flush=True)
-    )
+    settings = same_iterations(spec["train"])
+    sender = Sender(run, service, kind, settings, lambda text: print(f"{kind}: {text}", flush=True))
     if not sender.step(None, 0):
         return _fail(f"{kind}: not everything was sent; run this again")
     try:

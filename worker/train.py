@@ -13,7 +13,7 @@ from worker.telemetry.tracking_processes import Tracking
 if TYPE_CHECKING:
     from worker.learning.hooks import Hook
     from worker.tasks.run.task import Task
-    from worker.telemetry.picture import Glance
+    from worker.telemetry.picture import EpisodePicture
 
 SWITCH_SECONDS = 0.0005
 """Longest time for which a reporting or saving thread may hold the interpreter, while the training thread's device may be idle [s]."""
@@ -60,12 +60,12 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
 def hooks() -> list[Hook]:
     """The hooks of every training: its tap, and its final evaluation."""
     from worker.evaluation.final_evaluation import FinalEvaluation
-    from worker.telemetry.live_tap import LiveTap
+    from worker.telemetry.tap import LiveTap
 
-    def draw(worlds: Task) -> Glance:
-        from worker.telemetry.picture import Glance  # it takes a while, and most jobs of a sweep draw nothing
+    def draw(worlds: Task) -> EpisodePicture:
+        from worker.telemetry.picture import EpisodePicture  # it takes a while, and most jobs of a sweep draw nothing
 
-        return Glance(worlds)
+        return EpisodePicture(worlds)
 
     return [LiveTap(), FinalEvaluation(None if os.environ.get("MUSTER_PICTURE") == "0" else draw)]
 

@@ -44,9 +44,9 @@ class Commands:
 
     def __init__(self, contract: Contract, names: Mapping[str, str] | None = None, strict: bool = False) -> None:
         if not contract.actions:
-            told = ", ".join(contract.action_names[:5])
+            labels = ", ".join(contract.action_names[:5])
             raise Refused(
-                f"task {contract.task} can't drive joints: the policy does not say what its actions are: {told}"
+                f"task {contract.task} can't drive joints: the policy does not say what its actions are: {labels}"
             )
         self._choices = _choices(contract) if contract.discrete else None
         if ruled := [action for action in contract.actions if action.rule]:
@@ -56,10 +56,8 @@ class Commands:
         self.actions = _joints(contract.actions[0]) if contract.discrete else contract.actions
         renamed = names or {}
         self.joints = [renamed.get(action.name, action.name) for action in self.actions]
-        self.kinds = {
-            kind: [index for index, action in enumerate(self.actions) if action.kind == kind] for kind in KINDS
-        }
-        self.kinds = {kind: columns for kind, columns in self.kinds.items() if columns}
+        kinds = [action.kind for action in self.actions]
+        self.kinds = {kind: [i for i, each in enumerate(kinds) if each == kind] for kind in KINDS if kind in kinds}
         self._scale = np.array([action.scale for action in self.actions])
         self._offset = np.array([action.offset for action in self.actions])
         clips = [action.clip or (-np.inf, np.inf) for action in self.actions]
@@ -98,21 +96,19 @@ class Commands:
         lines = []
         for name, action in zip(self.joints, self.actions, strict=True):
             low, high = limits(action, False)
-            unit = action.unit
-            gains = f"stiffness {action.stiffness:.4g}, damping {action.damping:.4g}"
             effort = "" if action.effort_limit is None else f", effort up to {action.effort_limit:.4g}"
             lines.append(
-                f"  {name:{width}}  {action.kind} [{unit}] {low:.3f} to {high:.3f}, default position "
-                f"{action.default_position:.4f}, {gains}{effort}"
+                f"  {name:{width}}  {action.kind} [{action.unit}] {low:.3f} to {high:.3f}, default position "
+                f"{action.default_position:.4f}, stiffness {action.stiffness:.4g}, damping {action.damping:.4g}{effort}"
             )
         return lines
 
 
 def _choices(contract: Contract) -> np.ndarray:
     """The commands of each choice, shape ``(choices, joints)``. Raises Refused where the contract lacks them."""
-    wanted = [(each.joint, each.kind) for each in contract.actions[0].targets]
-    for action in contract.actions:
-        if not wanted or [(each.joint, each.kind) for each in action.targets] != wanted:
+    joints = [[(each.joint, each.kind) for each in action.targets] for action in contract.actions]
+    for action, each in zip(contract.actions, joints, strict=True):
+        if not each or each != joints[0]:
             raise Refused(
                 f"task {contract.task} can't drive joints: the contract does not say what the choice {action.name} asks of them; "
                 "export the policy again, of a task that declares it"
@@ -123,8 +119,7 @@ def _choices(contract: Contract) -> np.ndarray:
 def _joints(choice: Action) -> tuple[Action, ...]:
     """The joints that a choice commands, as actions without gains and limits: the contract has none of them."""
     return tuple(
-        Action(each.joint, each.kind, each.unit, 1.0, 0.0, None, 0.0, 0.0, 0.0, None, None, "")
-        for each in choice.targets
+        Action(each.joint, each.kind, each.unit, 1.0, 0.0, None, 0.0, 0.0, 0.0, None, "") for each in choice.targets
     )
 
 

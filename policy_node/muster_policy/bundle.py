@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from muster_policy.contract import Contract, read
 from muster_policy.errors import Refused
-from muster_policy.weights import lie_elsewhere
 
 FORMAT = 1
 """The newest version of the manifest that the node reads."""
@@ -65,7 +65,8 @@ def open_bundle(path: Path) -> Bundle:
             raise Refused(f"{path}: {name} was altered (SHA-256 differs); copy the bundle once more")
         if name in ("contract.json", "policy.onnx", "parity.npz"):
             content[name] = data
-    for name in sorted(_listed(path) - set(manifest["files"]) - {MANIFEST}):
+    names = {str((Path(folder) / name).relative_to(path)) for folder, _, names in os.walk(path) for name in names}
+    for name in sorted(names - set(manifest["files"]) - {MANIFEST}):
         raise Refused(f"{path}: {name} was added, {MANIFEST} does not list it; remove it")
     for name in ("contract.json", "policy.onnx", "parity.npz"):
         if name not in content:
@@ -117,5 +118,70 @@ def _read(path: Path, name: str) -> bytes:
         raise Refused(f"{path}: {name} can't be read ({error.strerror})") from None
 
 
-def _listed(path: Path) -> set[str]:
-    return {str((Path(folder) / name).relative_to(path)) for folder, _, names in os.walk(path) for name in names}
+PARTS = {
+    "ModelProto": {7: "GraphProto", 20: "TrainingInfoProto", 25: "FunctionProto"},
+    "GraphProto": {1: "NodeProto", 5: "TensorProto", 15: "SparseTensorProto"},
+    "SparseTensorProto": {1: "TensorProto", 2: "TensorProto"},
+    "NodeProto": {5: "AttributeProto"},
+    "AttributeProto": {
+        **{5: "TensorProto", 10: "TensorProto", 6: "GraphProto", 11: "GraphProto"},
+        **{22: "SparseTensorProto", 23: "SparseTensorProto"},
+    },
+    "FunctionProto": {7: "NodeProto", 11: "AttributeProto"},
+    "TrainingInfoProto": {1: "GraphProto", 2: "GraphProto"},
+}
+"""Messages in which a tensor may be, by type and number of their field (onnx.proto)."""
+EXTERNAL = (13, 14)
+"""Fields of a TensorProto, external_data and data_location, which a tensor within the model lacks or has as 0."""
+
+
+def lie_elsewhere(model: bytes) -> bool:
+    """Whether a tensor of an ONNX model lies in another file.
+
+    Raises:
+        ValueError: The bytes are no protobuf.
+    """
+    pending = [("ModelProto", memoryview(model))]
+    while pending:
+        kind, message = pending.pop()
+        for number, value in _fields(message):
+            if kind == "TensorProto":
+                if number in EXTERNAL and value:
+                    return True
+            elif isinstance(value, memoryview) and (part := PARTS[kind].get(number)):
+                pending.append((part, value))
+    return False
+
+
+def _fields(message: memoryview) -> Iterator[tuple[int, int | memoryview]]:
+    """Number and value of each field: a number, or the bytes of a text, a list or a message."""
+    place = 0
+    while place < len(message):
+        key, place = _number(message, place)
+        wire = key & 7
+        if wire == 0:
+            value, place = _number(message, place)
+            yield key >> 3, value
+            continue
+        if wire == 2:
+            size, place = _number(message, place)
+        else:
+            size = {1: 8, 5: 4}.get(wire, len(message) + 1)
+        if place + size > len(message):
+            raise ValueError("no protobuf")
+        yield key >> 3, message[place : place + size]
+        place += size
+
+
+def _number(message: memoryview, place: int) -> tuple[int, int]:
+    """A number of variable length, and where it ends."""
+    value = 0
+    for shift in range(0, 70, 7):
+        if place >= len(message):
+            break
+        byte = message[place]
+        place += 1
+        value |= (byte & 127) << shift
+        if byte < 128:
+            return value, place
+    raise ValueError("no protobuf")

@@ -9,15 +9,15 @@ import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from muster_policy import __version__
 from muster_policy.bundle import Bundle, open_bundle
 from muster_policy.errors import Refused, nearest
 from muster_policy.messages import DISTRIBUTIONS
 from muster_policy.node import PolicyNode, Settings
+from muster_policy.observations import IMU
 from muster_policy.policy import Policy
-from muster_policy.snapshot import IMU
 
 EXAMPLES = """\
 examples:
@@ -35,15 +35,16 @@ episode when std_msgs/Empty arrives on ~/reset. docs/policy-node.md says more.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command; returns its exit status: 0 after a clean end, 1 for a mismatch, 2 for wrong use."""
-    given = parser().parse_args(arguments)
+    settings = parser().parse_args(arguments, Settings())
     try:
-        bundle = open_bundle(given.bundle)
+        bundle = open_bundle(settings.bundle)
         policy = Policy(bundle)
         greatest = policy.self_test(bundle.parity)
         _say(f"{bundle.contract.task} of {bundle.origin}: self-test passed, actions differ by {greatest:.1e} at most")
-        node = PolicyNode(bundle, _settings(given, bundle), policy, _say)
+        _complete(settings, bundle)
+        node = PolicyNode(bundle, settings, policy, _say)
         _introduce(node, bundle)
-        if given.check:
+        if settings.check:
             return 0
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             signal.signal(number, lambda *_: node.stopping.set())
@@ -60,10 +61,10 @@ class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         words = message.removeprefix("argument ")
         if unknown := re.match(r"unrecognized arguments: (\S+)", message):
-            word, options = unknown[1], [name for name in self._option_string_actions if name.startswith("--")]
+            word = unknown[1]
             words = f"{word}: more arguments than the command takes"
             if word.startswith("-"):
-                near = nearest(word, options)
+                near = nearest(word, [name for name in self._option_string_actions if name.startswith("--")])
                 words = f"{word}: there is no such option" + (f"; {near}" if near.startswith("did") else "")
         elif missing := re.match(r"the following arguments are required: (.*)", message):
             words = f"{missing[1].upper()} is missing"
@@ -96,11 +97,13 @@ def parser() -> argparse.ArgumentParser:
     )
     add(
         "--joints",
+        dest="joints_file",
         type=Path,
         metavar="FILE",
         help="lines `policy_joint = robot_joint`, for joints with other names on the robot",
     )
-    add("--remap", action="append", default=[], metavar="TOPIC:=NAME", help="use another topic; may be repeated")
+    repeated: dict[str, Any] = {"action": "append", "default": [], "dest": "remappings"}
+    add("--remap", **repeated, metavar="TOPIC:=NAME", help="use another topic; may be repeated")
     add("--controller", metavar="NAME", help="also publish std_msgs/Float64MultiArray on NAME/commands")
     add("--strict-limits", action="store_true", help="keep position targets within the joints' ranges")
     add("--domain", type=_whole, default=None, metavar="ID", help="ROS domain (default: ROS_DOMAIN_ID, or 0)")
@@ -118,27 +121,26 @@ def parser() -> argparse.ArgumentParser:
     return found
 
 
-def _settings(given: argparse.Namespace, bundle: Bundle) -> Settings:
-    names = [action.name for action in bundle.contract.actions if action.kind != "choice"]
-    names += [target.joint for action in bundle.contract.actions for target in action.targets]
-    for group in bundle.contract.groups:
-        names += [name for term in group.terms if term.element == "joint" for name in term.elements]
-    return Settings(
-        rate=given.rate,
-        trigger=given.trigger,
-        timeout=given.timeout,
-        strict=given.strict_limits,
-        controller=given.controller and _ros_name("--controller", given.controller),
-        joints=read_joints(given.joints, names) if given.joints else {},
-        remap=dict(_remapping(each) for each in given.remap),
-        distribution=given.distro,
-        domain=_domain(given.domain),
-        connect=given.connect or (None if given.listen else "tcp/localhost:7447"),
-        listen=given.listen,
-        namespace=_ros_name("--namespace", given.namespace) if given.namespace.strip("/") else "/",
-        name=_ros_name("--name", given.name),
-        duration=given.duration,
-    )
+def _complete(settings: Settings, bundle: Bundle) -> None:
+    """Check names, and fill in what depends on other options, the environment or the bundle. Raises Refused."""
+    remap = {}
+    for each in settings.remappings:
+        topic, sign, name = each.partition(":=")
+        if not (topic and sign and name):
+            raise Refused(f"--remap {each}: expected TOPIC:=NAME, such as imu:=/imu/data")
+        remap[topic] = _ros_name("--remap", name)
+    settings.remap = remap
+    settings.controller = settings.controller and _ros_name("--controller", settings.controller)
+    settings.joints = read_joints(settings.joints_file, bundle.contract.joints) if settings.joints_file else {}
+    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
+    if settings.domain is None and not text.isdigit():
+        raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
+    settings.domain = int(text) if settings.domain is None else settings.domain
+    if not 0 <= settings.domain <= 232:
+        raise Refused(f"domain {settings.domain}: expected 0 to 232")
+    settings.connect = settings.connect or (None if settings.listen else "tcp/localhost:7447")
+    settings.namespace = _ros_name("--namespace", settings.namespace) if settings.namespace.strip("/") else "/"
+    settings.name = _ros_name("--name", settings.name)
 
 
 def read_joints(path: Path, known: Sequence[str]) -> dict[str, str]:
@@ -193,13 +195,6 @@ def _introduce(node: PolicyNode, bundle: Bundle) -> None:
         _say(line)
 
 
-def _remapping(text: str) -> tuple[str, str]:
-    topic, sign, name = text.partition(":=")
-    if not (topic and sign and name):
-        raise Refused(f"--remap {text}: expected TOPIC:=NAME, such as imu:=/imu/data")
-    return topic, _ros_name("--remap", name)
-
-
 def _ros_name(option: str, text: str) -> str:
     """A valid ROS name. Raises Refused."""
     parts = text.removeprefix("/").split("/")
@@ -208,16 +203,6 @@ def _ros_name(option: str, text: str) -> str:
     if option == "--name" and "/" in text:
         raise Refused(f"--name {text}: a node's name has no slash; give --namespace besides")
     return text
-
-
-def _domain(given: int | None) -> int:
-    text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
-    if given is None and not text.isdigit():
-        raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
-    domain = int(text) if given is None else given
-    if not 0 <= domain <= 232:
-        raise Refused(f"domain {domain}: expected 0 to 232")
-    return domain
 
 
 def _positive(text: str) -> float:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from types import UnionType
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -30,8 +31,8 @@ class Frame:
 
     name: str
     body: str
-    position: np.ndarray
-    rotation: np.ndarray
+    position: tuple[float, ...]
+    rotation: tuple[float, ...]
     root: bool
 
 
@@ -47,13 +48,13 @@ class Term:
     clip: Pair | None
     history: int
     quantity: str
-    library: bool
     parameters: Mapping[str, Sequence[float]]
     element: str
     elements: tuple[str, ...]
     sensors: Mapping[str, str]
     command: str
-    frame: Frame | None
+    library: bool = False
+    frame: Frame | None = None
 
     @property
     def size(self) -> int:
@@ -105,8 +106,8 @@ class Action:
     stiffness: float
     damping: float
     effort_limit: float | None
-    range: Pair | None
     rule: str
+    range: Pair | None = None
     targets: tuple[Target, ...] = ()
     """Of a choice."""
 
@@ -119,8 +120,8 @@ class Command:
     names: tuple[str, ...]
     units: tuple[str, ...]
     ranges: tuple[Pair | None, ...]
-    quantity: str
-    library: bool
+    quantity: str = ""
+    library: bool = False
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,15 @@ class Contract:
     states: tuple[State, ...]
     discrete: bool
 
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Names of the joints that the policy reads or drives."""
+        names = [action.name for action in self.actions if action.kind != "choice"]
+        names += [target.joint for action in self.actions for target in action.targets]
+        for group in self.groups:
+            names += [joint for term in group.terms if term.element == "joint" for joint in term.elements]
+        return tuple(dict.fromkeys(names))
+
     def command(self, name: str) -> Command | None:
         """The command of that name."""
         return next((command for command in self.commands if command.name == name), None)
@@ -166,17 +176,7 @@ def read(text: bytes, where: str) -> Contract:
         version = found["format"]
         if version > FORMAT:
             raise Refused(f"{where}: has format {version}, this node reads up to {FORMAT}; upgrade muster-policy")
-        contract = Contract(
-            task=found["task"],
-            format=version,
-            control_hz=float(found["control_hz"]),
-            groups=tuple(map(_group, found["groups"])),
-            actions=tuple(map(_action, found["actions"])),
-            action_names=tuple(found["action_names"]),
-            commands=tuple(map(_command, found["commands"])),
-            states=tuple(State(each["name"], each["output"], tuple(each["shape"])) for each in found["states"]),
-            discrete=bool(found["discrete"]),
-        )
+        contract: Contract = _part(Contract, found)
     except KeyError as error:
         raise Refused(f"{where}: {error.args[0]} is missing; export the policy again") from None
     except (ValueError, TypeError, AttributeError) as error:
@@ -184,88 +184,27 @@ def read(text: bytes, where: str) -> Contract:
     if not 0.0 < contract.control_hz <= 10_000.0:
         raise Refused(f"{where}: control_hz is {contract.control_hz:g}; export the policy again")
     for group in contract.groups:
-        there = sum(term.size for term in group.terms)
-        if group.terms and (there,) != group.shape:
-            raise Refused(f"{where}: the terms of {group.name} have {there} numbers, its shape is {list(group.shape)}")
+        size = sum(term.size for term in group.terms)
+        if group.terms and (size,) != group.shape:
+            raise Refused(f"{where}: the terms of {group.name} have {size} numbers, its shape is {list(group.shape)}")
     return contract
 
 
-def _numbers(values: Any) -> np.ndarray:
-    return np.asarray(values, dtype=np.float32)
+def _part(kind: Any, found: Any) -> Any:
+    """A part of the contract from its JSON, by the types of its fields; names that it does not know are left out.
 
-
-def _pair(value: Any) -> Pair | None:
-    return None if value is None else (float(value[0]), float(value[1]))
-
-
-def _group(found: Mapping[str, Any]) -> Group:
-    image = found["image"]
-    return Group(
-        name=found["name"],
-        input=found["input"],
-        shape=tuple(found["shape"]),
-        dtype=found["dtype"],
-        terms=tuple(map(_term, found["terms"])),
-        image=None if image is None else Image(tuple(image["channels"]), int(image["frames"])),
-    )
-
-
-def _term(found: Mapping[str, Any]) -> Term:
-    frame = found.get("frame")
-    return Term(
-        name=found["name"],
-        kind=found["kind"],
-        names=tuple(found["names"]),
-        scale=_numbers(found["scale"]),
-        offset=_numbers(found["offset"]),
-        clip=_pair(found["clip"]),
-        history=int(found["history"]),
-        quantity=found["quantity"],
-        library=bool(found.get("library", False)),
-        parameters=found["parameters"],
-        element=found["element"],
-        elements=tuple(found["elements"]),
-        sensors=found["sensors"],
-        command=found["command"],
-        frame=None
-        if frame is None
-        else Frame(
-            frame["name"],
-            frame["body"],
-            np.asarray(frame["position"], float),
-            np.asarray(frame["rotation"], float),
-            bool(frame["root"]),
-        ),
-    )
-
-
-def _action(found: Mapping[str, Any]) -> Action:
-    limit = found["effort_limit"]
-    return Action(
-        name=found["name"],
-        kind=found["kind"],
-        unit=found["unit"],
-        scale=float(found["scale"]),
-        offset=float(found["offset"]),
-        clip=_pair(found["clip"]),
-        default_position=float(found["default_position"]),
-        stiffness=float(found["stiffness"]),
-        damping=float(found["damping"]),
-        effort_limit=None if limit is None else float(limit),
-        range=_pair(found.get("range")),
-        rule=found["rule"],
-        targets=tuple(
-            Target(each["joint"], each["kind"], each["unit"], float(each["value"])) for each in found.get("targets", ())
-        ),
-    )
-
-
-def _command(found: Mapping[str, Any]) -> Command:
-    return Command(
-        name=found["name"],
-        names=tuple(found["names"]),
-        units=tuple(found["units"]),
-        ranges=tuple(map(_pair, found["ranges"])),
-        quantity=found.get("quantity", ""),
-        library=bool(found.get("library", False)),
-    )
+    Raises KeyError, TypeError, ValueError, AttributeError.
+    """
+    parts = get_args(kind)
+    if isinstance(kind, type) and is_dataclass(kind):
+        types = get_type_hints(kind)
+        names = [each.name for each in fields(kind) if each.name in found or each.default is MISSING]
+        return kind(**{name: _part(types[name], found[name]) for name in names})
+    if get_origin(kind) is UnionType:
+        return None if found is None else _part(parts[0], found)
+    if get_origin(kind) is tuple:
+        kinds = [parts[0]] * len(found) if parts[-1] is ... else parts
+        return tuple(_part(each, value) for each, value in zip(kinds, found, strict=True))
+    if kind is np.ndarray:
+        return np.asarray(found, dtype=np.float32)
+    return kind(found) if kind in (int, float, bool) else found

@@ -18,8 +18,8 @@ def nearest(name: str, names: Iterable[str], what: str = "there are") -> str:
         names: What there is.
         what: Begins the list of names.
     """
-    there = sorted(names)
-    close = difflib.get_close_matches(name, there, 1, 0.5)
+    known = sorted(names)
+    close = difflib.get_close_matches(name, known, 1, 0.5)
     if close:
         return f"did you mean {close[0]}?"
-    return f"{what}: {', '.join(there[:8])}{', …' if len(there) > 8 else ''}" if there else f"{what} none"
+    return f"{what}: {', '.join(known[:8])}{', …' if len(known) > 8 else ''}" if known else f"{what} none"

@@ -106,7 +106,7 @@ class Node:
         self._zid, self._entity = str(session.zid()), 0
         self._tokens = [session.liveliness().declare_token(node_token(domain, self._zid, 0, self.namespace, name))]
         self._ears: list[Any] = []
-        self._there: dict[str, Endpoint] = {}
+        self._known: dict[str, Endpoint] = {}
 
     def full_name(self, topic: str) -> str:
         """The full name of a topic: ``~/reset`` is the node's own, ``imu`` its namespace's, ``/imu`` as it stands."""
@@ -140,8 +140,8 @@ class Node:
         key = topic_key(self.domain, full, "*", "*")
         self._ears.append(self.session.declare_subscriber(key, zenoh.handlers.Callback(hear, indirect=False)))
 
-    def serve(self, name: str, kind: str, asked: Callable[[Answer], None]) -> None:
-        """Offer a service of a ROS type without parameters: ``asked`` gets the answer to each request, and must not wait for anything."""
+    def serve(self, name: str, kind: str, requested: Callable[[Answer], None]) -> None:
+        """Offer a service of a ROS type without parameters: ``requested`` gets the answer to each request, and must not wait for anything."""
         full = self.full_name(name)
         _, key = self.declare("SS", full, kind, Qos())
 
@@ -154,7 +154,7 @@ class Node:
                 with contextlib.suppress(zenoh.ZError), query:
                     query.reply(key, data, attachment=attachment(known[0], time.time_ns(), known[2]))
 
-            asked(answer)
+            requested(answer)
 
         ear = zenoh.handlers.Callback(hear, indirect=False)
         # clients of rmw_zenoh ask complete queryables alone
@@ -163,24 +163,20 @@ class Node:
     def watch_graph(self) -> None:
         """Begin to know the endpoints of others."""
 
-        def told(sample: zenoh.Sample) -> None:
+        def changed(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
             if sample.kind == zenoh.SampleKind.DELETE:
-                self._there.pop(key, None)
+                self._known.pop(key, None)
             elif (endpoint := parse_token(key)) is not None:
-                self._there[key] = endpoint
+                self._known[key] = endpoint
 
-        ear = zenoh.handlers.Callback(told, indirect=False)
+        ear = zenoh.handlers.Callback(changed, indirect=False)
         everywhere = f"@ros2_lv/{self.domain}/**"
         self._ears.append(self.session.liveliness().declare_subscriber(everywhere, ear, history=True))
 
-    def publishers_of(self, topic: str) -> list[Endpoint]:
-        """Publishers on a topic that are there now."""
-        return [each for each in list(self._there.values()) if each.kind == "MP" and each.name == topic]
-
-    def topics_of(self, kind: str) -> list[str]:
-        """Topics on which messages of a ROS type are published now."""
-        return sorted({each.name for each in list(self._there.values()) if each.kind == "MP" and each.type == kind})
+    def publishers(self) -> list[Endpoint]:
+        """All publishers of the graph that are known now."""
+        return [each for each in list(self._known.values()) if each.kind == "MP"]
 
     def close(self) -> None:
         """Leave the graph: undeclare what was declared."""

@@ -15,10 +15,19 @@ import numpy as np
 from muster_policy.contract import Command, Group
 from muster_policy.errors import Refused, nearest
 from muster_policy.messages import ARRAY, IMAGE, IMU, JOINT_STATE, ODOMETRY, TWIST, Messages
-from muster_policy.observations import Observations, command_topic, image_topic, is_twist
-from muster_policy.snapshot import IMU as IMU_TOPIC
-from muster_policy.snapshot import JOINTS, Imu, Odometry, Snapshot, matrix
-from muster_policy.snapshot import ODOMETRY as ODOMETRY_TOPIC
+from muster_policy.observations import IMU as IMU_TOPIC
+from muster_policy.observations import (
+    JOINTS,
+    Imu,
+    Observations,
+    Odometry,
+    Snapshot,
+    command_topic,
+    image_topic,
+    is_twist,
+    matrix,
+)
+from muster_policy.observations import ODOMETRY as ODOMETRY_TOPIC
 
 COMMAND_TIMEOUT = 0.5
 """Age from which a commanded velocity no longer counts: the policy is then commanded to stand [s]."""
@@ -50,6 +59,30 @@ class Input:
     waiting: tuple[bytes, float] | None = None
     count: int = 0
 
+    def is_silent(self, now: float) -> bool:
+        """Whether it is a commanded velocity that is too old to count."""
+        return self.command is not None and is_twist(self.command) and now - self.arrived > COMMAND_TIMEOUT
+
+    def is_too_slow(self, now: float) -> bool:
+        """Whether it is a commanded velocity between 0 and the training's range: the policy would go faster than commanded."""
+        if self.command is None or not is_twist(self.command):
+            return False
+        pairs = zip(self._commanded(now), self.command.ranges, strict=True)
+        return any(pair is not None and (0.0 < pair[0] > value or 0.0 > pair[1] < value) for value, pair in pairs)
+
+    def limited(self, now: float) -> np.ndarray:
+        """The numbers of a command, clipped to its range in training."""
+        assert self.command is not None
+        ends = [(-np.inf, np.inf) if pair is None else pair for pair in self.command.ranges]
+        within: np.ndarray = np.clip(self._commanded(now), *np.array(ends).T)
+        return within
+
+    def _commanded(self, now: float) -> np.ndarray:
+        """The numbers of a command; a commanded velocity that is too old is 0."""
+        assert self.command is not None
+        value: np.ndarray = np.zeros(len(self.command.names)) if self.is_silent(now) else self.value
+        return value
+
 
 class Inputs:
     """All inputs of a policy.
@@ -80,7 +113,7 @@ class Inputs:
         self.ignored: Counter[str] = Counter()
         """Count of unusable messages, by topic."""
         self._complaints: deque[str] = deque(maxlen=100)
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     def hear(self, each: Input, topic: str) -> Callable[[bytes, str, str], None]:
         """The callback for each message of an input, on any thread.
@@ -89,13 +122,13 @@ class Inputs:
             each: The input.
             topic: Its full name, for complaints.
         """
-        wanted = self._messages.type_hash(each.kind)
+        expected = self._messages.type_hash(each.kind)
 
         def received(data: bytes, kind: str, type_hash: str) -> None:
             if kind != each.kind:
                 self._complain(topic, f"it is a {kind}, and the node reads {each.kind}")
-            elif type_hash != wanted:
-                what = f"{kind} of another definition ({type_hash[:20]}…, here {wanted[:20]}…)"
+            elif type_hash != expected:
+                what = f"{kind} of another definition ({type_hash[:20]}…, here {expected[:20]}…)"
                 self._complain(topic, f"{what}; give --distro as the robot has it")
             else:
                 with self.news:
@@ -125,10 +158,7 @@ class Inputs:
 
     def complaints(self) -> list[str]:
         """Unusable messages since the last call, one line for each different problem."""
-        found = []
-        while self._complaints:
-            found.append(self._complaints.popleft())
-        return found
+        return [self._complaints.popleft() for _ in range(len(self._complaints))]
 
     def missing(self) -> list[Input]:
         """Inputs without a good message yet."""
@@ -139,23 +169,13 @@ class Inputs:
         ages = [(each, now - each.arrived) for each in self.all if each.command is None]
         return [(each, age) for each, age in ages if age > timeout]
 
-    def too_slow(self, now: float) -> list[Input]:
-        """Commanded velocities between 0 and the training's range: the policy would go faster than commanded."""
-        return [
-            each for each in self.all if each.command is not None and is_twist(each.command) and _is_too_slow(each, now)
-        ]
-
     def snapshot(self, now: float) -> Snapshot:
         """The current inputs; none may be missing. A commanded velocity that is too old is 0."""
         values = {each.topic: each.value for each in self.all}
-        commands = {each.command.name: _limited(each, now) for each in self.all if each.command is not None}
+        commands = {each.command.name: each.limited(now) for each in self.all if each.command is not None}
         position, velocity = values[JOINTS]
         images = {name: values[image_topic(name)] for name in self._observations.images}
         return Snapshot(position, velocity, values.get(IMU_TOPIC), values.get(ODOMETRY_TOPIC), commands, images)
-
-    def silent_commands(self, now: float) -> list[Input]:
-        """Commanded velocities that are too old to count."""
-        return [each for each in self.all if _is_silent(each, now)]
 
     def _joint_state(self, message: Any) -> tuple[np.ndarray, np.ndarray]:
         names = tuple(message.name)
@@ -185,36 +205,9 @@ class Inputs:
         self.ignored[topic] += 1
         line = f"{topic}: message ignored: {problem}"
         kind = re.sub(r"[0-9.]+", "#", line)  # the same problem with other numbers is reported once
-        if kind not in self._told and len(self._told) < _DIFFERENT:
-            self._told.add(kind)
+        if kind not in self._reported and len(self._reported) < _DIFFERENT:
+            self._reported.add(kind)
             self._complaints.append(line)
-
-
-def _is_silent(each: Input, now: float) -> bool:
-    return each.command is not None and is_twist(each.command) and now - each.arrived > COMMAND_TIMEOUT
-
-
-def _asked(each: Input, now: float) -> np.ndarray:
-    """The numbers of a command; a commanded velocity that is too old is 0."""
-    assert each.command is not None
-    value: np.ndarray = np.zeros(len(each.command.names)) if _is_silent(each, now) else each.value
-    return value
-
-
-def _is_too_slow(each: Input, now: float) -> bool:
-    assert each.command is not None
-    pairs = zip(_asked(each, now), each.command.ranges, strict=True)
-    return any(pair is not None and (0.0 < pair[0] > value or 0.0 > pair[1] < value) for value, pair in pairs)
-
-
-def _limited(each: Input, now: float) -> np.ndarray:
-    """A command, clipped to its range in training."""
-    assert each.command is not None
-    value = _asked(each, now)
-    ends = [(-np.inf, np.inf) if pair is None else pair for pair in each.command.ranges]
-    low, high = np.array(ends).T
-    within: np.ndarray = np.clip(value, low, high)
-    return within
 
 
 def _finite(values: Any, what: str) -> np.ndarray:
@@ -238,23 +231,22 @@ def _rotation(turn: Any) -> np.ndarray:
 
 def _imu_for(quantities: set[str]) -> Callable[[Any], Imu]:
     """A reader of the fields that these quantities need; by ROS's convention, a covariance that begins with -1 means "not measured"."""
-    needs_turn = bool(quantities & {"projected_gravity", "root_uprightness", "imu_projected_gravity"})
-    needs_rate = bool(quantities & {"imu_angular_velocity", "root_angular_velocity"})
-    needs_force = "imu_acceleration" in quantities
+
+    def needs(message: Any, field: str, *known: str, hint: str = "") -> bool:
+        missing = quantities.intersection(known) and getattr(message, f"{field}_covariance")[0] == -1.0
+        if missing:
+            what = {"linear_acceleration": "acceleration"}.get(field, field.replace("_", " "))
+            raise Refused(f"it has no {what} ({field}_covariance[0] is -1){hint}")
+        return bool(quantities.intersection(known))
 
     def read(message: Any) -> Imu:
         turn, rate, force = np.eye(3), np.zeros(3), np.zeros(3)
-        if needs_turn:
-            if message.orientation_covariance[0] == -1.0:
-                raise Refused("it has no orientation (orientation_covariance[0] is -1); run a filter that estimates it")
+        turned = "projected_gravity", "root_uprightness", "imu_projected_gravity"
+        if needs(message, "orientation", *turned, hint="; run a filter that estimates it"):
             turn = matrix(_rotation(message.orientation))
-        if needs_force:
-            if message.linear_acceleration_covariance[0] == -1.0:
-                raise Refused("it has no acceleration (linear_acceleration_covariance[0] is -1)")
+        if needs(message, "linear_acceleration", "imu_acceleration"):
             force = _xyz(message.linear_acceleration, "linear acceleration")
-        if needs_rate:
-            if message.angular_velocity_covariance[0] == -1.0:
-                raise Refused("it has no angular velocity (angular_velocity_covariance[0] is -1)")
+        if needs(message, "angular_velocity", "imu_angular_velocity", "root_angular_velocity"):
             rate = _xyz(message.angular_velocity, "angular velocity")
         return Imu(turn, rate, force)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
 from muster_policy.errors import Refused
@@ -86,7 +87,5 @@ class Messages:
 
     def array(self, values: Any) -> Any:
         """A ``std_msgs/Float64MultiArray`` of one dimension."""
-        import numpy as np
-
         layout = self.make("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
         return self.make(ARRAY, layout=layout, data=np.asarray(values, dtype=np.float64))

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
+import argparse
 import gc
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from muster_policy.actions import Command, Commands
 from muster_policy.bundle import Bundle
 from muster_policy.errors import Refused
 from muster_policy.graph import Answer, Node, open_session
 from muster_policy.inputs import Inputs
-from muster_policy.lines import Lines
 from muster_policy.messages import ARRAY, DIAGNOSTICS, EMPTY, JOINT_STATE, LOG, NOTHING, RESET, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 from muster_policy.runner import Mode, Runner
-from muster_policy.timing import Figures, sleep_until
+from muster_policy.timing import Figures, Lines, sleep_until
 from muster_policy.wire import Qos
 
 REPORT = 10.0
 """Time between two lines about the loop [s]."""
 PATIENCE = 5.0
 """Time between two lines about missing inputs [s]."""
-
-
 SLOW = 0.8
 """Share of the rate below which the node warns."""
 
@@ -42,41 +40,27 @@ class _Report:
     stops: int = 0
 
 
-@dataclass(frozen=True)
-class Settings:
-    """Settings of the node.
+class Settings(argparse.Namespace):
+    """Settings of the node: the options of the command, ``muster-policy --help``."""
 
-    Attributes:
-        rate: Control steps per second; None: as in training.
-        trigger: ``timer``: at the rate, by the clock; ``joint_states``: when a joint state arrives, at most at the rate.
-        timeout: Age from which a measurement is too old [s]; None: three control steps, at least 20 ms.
-        strict: Keep position targets within the joints' ranges.
-        controller: Also publish to this ros2_control controller.
-        joints: Name of a joint on the robot by its name in the contract, if it differs.
-        remap: Replacement topics by the node's topics.
-        distribution: Of ROS 2.
-        domain: ROS domain.
-        connect: Endpoint of a router; None: none.
-        listen: Be a router on this endpoint.
-        namespace: Of the node.
-        name: Of the node.
-        duration: Time after which it ends by itself [s]; None: never.
-    """
-
-    rate: float | None = None
-    trigger: str = "timer"
-    timeout: float | None = None
-    strict: bool = False
-    controller: str | None = None
-    joints: Mapping[str, str] = field(default_factory=dict)
-    remap: Mapping[str, str] = field(default_factory=dict)
-    distribution: str = "jazzy"
-    domain: int = 0
-    connect: str | None = "tcp/localhost:7447"
-    listen: str | None = None
-    namespace: str = "/"
-    name: str = "muster_policy"
-    duration: float | None = None
+    rate: float | None
+    """Control steps per second; None: as in training."""
+    trigger: str
+    timeout: float | None
+    """Age from which a measurement is too old [s]; None: three control steps, at least 20 ms."""
+    strict_limits: bool
+    controller: str | None
+    joints: Mapping[str, str]
+    """Name of a joint on the robot by its name in the contract, if it differs."""
+    remap: Mapping[str, str]
+    """Replacement topics by the node's topics."""
+    distro: str
+    domain: int
+    connect: str | None
+    listen: str | None
+    namespace: str
+    name: str
+    duration: float | None
 
 
 class PolicyNode:
@@ -96,9 +80,9 @@ class PolicyNode:
         self.settings, self._tell, self._print = settings, tell, tell
         contract = bundle.contract
         self.rate = settings.rate or contract.control_hz
-        self.messages = Messages(settings.distribution)
+        self.messages = Messages(settings.distro)
         self.observations = Observations(contract)
-        self.commands = Commands(contract, settings.joints, settings.strict)
+        self.commands = Commands(contract, settings.joints, settings.strict_limits)
         if settings.controller and len(self.commands.kinds) > 1:
             raise Refused(
                 f"--controller {settings.controller}: the policy commands {' and '.join(self.commands.kinds)}, a "
@@ -144,7 +128,7 @@ class PolicyNode:
         remap = self.settings.remap
         topics = {each.topic: node.full_name(remap.get(each.topic, each.topic)) for each in self.inputs.all}
         self._topics = topics
-        self.runner.name_topics(topics)
+        self.runner.topics = topics
         out = node.full_name(remap.get("joint_commands", "joint_commands"))
         self._out = node.publisher(out, JOINT_STATE)
         controller = self.settings.controller
@@ -152,27 +136,21 @@ class PolicyNode:
         self._log = node.publisher("/rosout", LOG, Qos(depth=1000, transient_local=True))
         self._diagnostics = node.publisher("/diagnostics", DIAGNOSTICS)
         node.watch_graph()
-        node.subscribe("~/reset", EMPTY, self._hear_reset)
-        node.serve("~/reset", RESET, self._ask_reset)
+
+        def heard(data: bytes, kind: str, type_hash: str) -> None:
+            if kind == EMPTY:
+                self._request_reset()
+
+        node.subscribe("~/reset", EMPTY, heard)
+        node.serve("~/reset", RESET, self._request_reset)
         for each in self.inputs.all:
             node.subscribe(topics[each.topic], each.kind, self.inputs.hear(each, topics[each.topic]))
         self._tell(f"node {node.full_name('~/')[:-1]} of domain {node.domain}: {', '.join(topics.values())} -> {out}")
 
-    def _hear_reset(self, data: bytes, kind: str, type_hash: str) -> None:
-        if kind == EMPTY:
-            self._reset.set()
-
-    def _ask_reset(self, answer: Answer) -> None:
-        self._asking.append(answer)
+    def _request_reset(self, answer: Answer | None = None) -> None:
+        if answer is not None:
+            self._asking.append(answer)
         self._reset.set()
-
-    def _do_reset(self) -> None:
-        """Begin a fresh episode, and tell those that asked before it began."""
-        self._reset.clear()
-        asked = [self._asking.popleft() for _ in range(len(self._asking))]
-        self.runner.reset()
-        for answer in asked:
-            answer(NOTHING)
 
     def _loop(self) -> None:
         gc.collect()
@@ -187,17 +165,23 @@ class PolicyNode:
             if now > ends:
                 break
             if self._reset.is_set():
-                self._do_reset()
-            acted = self.runner.step(now, due=due is not None)
-            if due is not None and acted:
-                self._measure(due, now)
+                self._reset.clear()
+                waiting = [self._asking.popleft() for _ in range(len(self._asking))]
+                self.runner.reset()
+                for answer in waiting:  # those that asked before it began
+                    answer(NOTHING)
+            if self.runner.step(now, due=due is not None) and due is not None:
+                done = time.monotonic()
+                self.figures.add("late", now - due)
+                self.figures.add("step", done - now)
+                self.figures.add("joint state to command", done - self.inputs.all[0].arrived)
             self._flush()
             if now > second:
                 second = now + 1.0
                 self._diagnose()
             if self.runner.mode is Mode.WAITING and now > patience:
                 patience = now + PATIENCE
-                self._tell_missing()
+                self._report_missing()
             if now > report:
                 report = now + REPORT
                 self._tell(self.summary())
@@ -223,12 +207,6 @@ class PolicyNode:
         self._deadline = arrived if arrived > due + period else due  # a late joint state does not delay the next step
         return arrived
 
-    def _measure(self, due: float, now: float) -> None:
-        done = time.monotonic()
-        self.figures.add("late", now - due)
-        self.figures.add("step", done - now)
-        self.figures.add("joint state to command", done - self.inputs.all[0].arrived)
-
     def _publish(self, command: Command) -> None:
         for message in self.commands.joint_states(command, self.messages, time.time_ns()):
             self._out.publish(message)
@@ -248,31 +226,29 @@ class PolicyNode:
             self._log.publish(self.messages.make(LOG, stamp=stamp, level=30 if warning else 20, msg=line, **place))
 
     def _diagnose(self) -> None:
-        make, counts = self.messages.make, self.runner.counts
-        mode, values = self.runner.mode, {"steps": counts.steps, "limited": counts.limited, "stops": counts.stops}
+        make, counts, mode = self.messages.make, self.runner.counts, self.runner.mode
+        values = {"steps": counts.steps, "limited": counts.limited, "stops": counts.stops}
         values["ignored"] = sum(self.inputs.ignored.values())
-        level = {Mode.ACTING: 0, Mode.WAITING: 1, Mode.STOPPED: 2, Mode.ENDED: 2}[mode]
         pairs = [make("diagnostic_msgs/msg/KeyValue", key=key, value=str(value)) for key, value in values.items()]
         status = make(
             "diagnostic_msgs/msg/DiagnosticStatus",
-            level=level,
+            level={Mode.ACTING: 0, Mode.WAITING: 1, Mode.STOPPED: 2, Mode.ENDED: 2}[mode],
             name=f"{self._node.name}: policy",
             message=mode.value,
             hardware_id="",
             values=pairs,
         )
-        header = self.messages.header(time.time_ns())
-        self._diagnostics.publish(make(DIAGNOSTICS, header=header, status=[status]))
+        self._diagnostics.publish(make(DIAGNOSTICS, header=self.messages.header(time.time_ns()), status=[status]))
 
-    def _tell_missing(self) -> None:
+    def _report_missing(self) -> None:
         for each in self.inputs.missing():
-            topic = self._topics[each.topic]
-            there = self._node.publishers_of(topic)
-            others = [name for name in self._node.topics_of(each.kind) if name not in (topic, self._out.topic)]
-            if wrong := [other for other in there if other.type != each.kind]:
+            topic, publishers = self._topics[each.topic], self._node.publishers()
+            here = [other for other in publishers if other.name == topic]
+            others = sorted({other.name for other in publishers if other.type == each.kind} - {topic, self._out.topic})
+            if wrong := [other for other in here if other.type != each.kind]:
                 how = f"{wrong[0].node} publishes {wrong[0].type} there"
-            elif there:
-                how = f"{there[0].node} publishes it, and no message could be used yet"
+            elif here:
+                how = f"{here[0].node} publishes it, and no message could be used yet"
             elif others:
                 how = f"nobody publishes it; it may be {others[0]}: --remap {each.topic}:={others[0]}"
             else:

@@ -1,30 +1,186 @@
-"""The policy's observations, built from measurements by the contract: scale, clip, offsets, history, frames of a camera."""
+"""The policy's observations, built by the contract from a snapshot of the measurements: scale, clip, offsets, history, frames of a camera."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Protocol
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from muster_policy.contract import Command, Contract, Frame, Group, Term
 from muster_policy.errors import Refused
-from muster_policy.snapshot import FROM_IMU, FROM_ODOMETRY, IMU, JOINTS, ODOMETRY, OF_UNIT, Snapshot, place_of
+
+IMU, ODOMETRY, JOINTS = "imu", "odom", "joint_states"
+"""The inputs by their topics."""
+
+
+@dataclass(frozen=True)
+class Imu:
+    """An inertial measurement unit, in its own frame.
+
+    Attributes:
+        turn: From its frame to the world's, shape ``(3, 3)``.
+        angular: Angular velocity [rad/s], shape ``(3,)``.
+        acceleration: Less gravity, so that it points up at rest [m/s^2], shape ``(3,)``.
+    """
+
+    turn: np.ndarray
+    angular: np.ndarray
+    acceleration: np.ndarray
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Pose of the root's frame in the world, and its velocities along its own axes.
+
+    Attributes:
+        position: [m], shape ``(3,)``.
+        rotation: To the world's frame, a quaternion xyzw, shape ``(4,)``.
+        linear: Of the origin [m/s], shape ``(3,)``.
+        angular: [rad/s], shape ``(3,)``.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    linear: np.ndarray
+    angular: np.ndarray
+
+
+@dataclass
+class Snapshot:
+    """The current inputs.
+
+    Attributes:
+        position: Of the node's joints, in its order [m, rad], shape ``(joints,)``.
+        velocity: Of the same joints [m/s, rad/s].
+        imu: The unit; None if the policy needs none.
+        odometry: None if the policy needs none.
+        commands: Numbers by the command's name.
+        images: The newest image of each group, shape ``(channels, height, width)``, uint8.
+    """
+
+    position: np.ndarray
+    velocity: np.ndarray
+    imu: Imu | None = None
+    odometry: Odometry | None = None
+    commands: Mapping[str, np.ndarray] = field(default_factory=dict)
+    images: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Place:
+    """The place where a quantity is measured.
+
+    Attributes:
+        arm: Of the frame's origin, from the root's [m], shape ``(3,)``.
+        turn: From the frame to the root's, shape ``(3, 3)``.
+        unit: From the frame of the inertial measurement unit to the root's, shape ``(3, 3)``.
+    """
+
+    arm: np.ndarray
+    turn: np.ndarray
+    unit: np.ndarray
+
+
+Quantity = Callable[[Snapshot, Place], "np.ndarray | float"]
+
+
+def matrix(rotation: np.ndarray) -> np.ndarray:
+    """The rotation matrix of a quaternion xyzw, shape ``(3, 3)``."""
+    x, y, z, w = (float(each) for each in rotation)
+    return np.array(
+        [
+            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
+            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
+            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
+        ]
+    )
+
+
+def cross(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The cross product of two vectors; many times faster than numpy's for so few numbers."""
+    (a, b, c), (x, y, z) = first.tolist(), second.tolist()
+    return np.array([b * z - c * y, c * x - a * z, a * y - b * x])
+
+
+def place_of(frame: Frame | None, unit: Frame | None) -> Place:
+    """The place where a quantity is measured.
+
+    Args:
+        frame: Of the quantity, on the root's body; None: the root's own.
+        unit: Of the inertial measurement unit, on the root's body; None: the root's own.
+    """
+    arm = np.zeros(3) if frame is None else np.array(frame.position)
+    turns = [np.eye(3) if each is None else matrix(np.array(each.rotation)) for each in (frame, unit)]
+    return Place(arm, *turns)
+
+
+def _imu(snapshot: Snapshot) -> Imu:
+    assert snapshot.imu is not None
+    return snapshot.imu
+
+
+def _odometry(snapshot: Snapshot) -> Odometry:
+    assert snapshot.odometry is not None
+    return snapshot.odometry
+
+
+def _velocity(snapshot: Snapshot, place: Place) -> np.ndarray:
+    """Of the frame's origin, along its own axes."""
+    odometry = _odometry(snapshot)
+    found: np.ndarray = place.turn.T @ (odometry.linear + cross(odometry.angular, place.arm))
+    return found
+
+
+def _gravity(snapshot: Snapshot, place: Place) -> np.ndarray:
+    """The direction of down in the root's frame: that of the unit, turned to the root's axes."""
+    found: np.ndarray = place.unit @ -_imu(snapshot).turn[2]
+    return found
+
+
+def _in_world(snapshot: Snapshot, place: Place) -> np.ndarray:
+    found: np.ndarray = matrix(_odometry(snapshot).rotation) @ _velocity(snapshot, place)
+    return found
+
+
+def _heading(snapshot: Snapshot, place: Place) -> float:
+    forward = matrix(_odometry(snapshot).rotation)[:, 0]
+    return float(np.arctan2(forward[1], forward[0]))
+
+
+FROM_IMU: Mapping[str, Quantity] = {
+    "imu_angular_velocity": lambda snapshot, place: _imu(snapshot).angular,
+    "imu_acceleration": lambda snapshot, place: _imu(snapshot).acceleration,
+    "imu_projected_gravity": lambda snapshot, place: -_imu(snapshot).turn[2],
+    "root_angular_velocity": lambda snapshot, place: place.unit @ _imu(snapshot).angular,
+    "projected_gravity": _gravity,
+    "root_uprightness": lambda snapshot, place: -_gravity(snapshot, place)[2],
+}
+"""Quantities from a ``sensor_msgs/Imu``, by the name of the function in Muster's library."""
+FROM_ODOMETRY: Mapping[str, Quantity] = {
+    "imu_linear_velocity": _velocity,
+    "root_linear_velocity": _velocity,
+    "root_com_linear_velocity": _velocity,
+    "root_linear_velocity_in_world": _in_world,
+    "root_com_linear_velocity_in_world": _in_world,
+    "root_position": lambda snapshot, place: _odometry(snapshot).position,
+    "root_height": lambda snapshot, place: float(_odometry(snapshot).position[2]),
+    "root_orientation": lambda snapshot, place: (
+        (-1.0 if (turn := _odometry(snapshot).rotation)[3] < 0.0 else 1.0) * turn
+    ),
+    "heading": _heading,
+}
+"""Quantities from a ``nav_msgs/Odometry`` of the root's frame."""
+OF_UNIT = frozenset({"imu_angular_velocity", "imu_acceleration", "imu_projected_gravity"})
+"""Quantities in the unit's own frame; for these, the unit may be on any body."""
+
 
 Reader = Callable[[Snapshot], "np.ndarray | float"]
 VELOCITIES = frozenset({"velocity_command", "moving_velocity_command", "heading_velocity_command"})
 """Commands of Muster's library that are velocities forward, to the left [m/s] and turning left [rad/s]: a ``geometry_msgs/Twist``."""
 _JOINT_POSITIONS = ("joint_position", "measured_joint_position")
 _JOINT_OFFSETS = ("joint_offset", "measured_joint_offset")
-
-
-@dataclass(frozen=True)
-class _Read:
-    """A term and the reader of its quantity."""
-
-    term: Term
-    read: Reader
 
 
 class Observations:
@@ -47,18 +203,14 @@ class Observations:
 
     def __init__(self, contract: Contract) -> None:
         self._contract = contract
-        names = [action.name for action in contract.actions if action.kind != "choice"]
-        names += [target.joint for action in contract.actions for target in action.targets]
-        for group in contract.groups:
-            names += [joint for term in group.terms if term.element == "joint" for joint in term.elements]
-        self.joints = tuple(dict.fromkeys(names))
+        self.joints = contract.joints
         self.needs: set[str] = {JOINTS}
         self.quantities: set[str] = set()
         self.commands: dict[str, Command] = {}
         self.images = {group.name: group for group in contract.groups if group.image is not None}
         self._problems: list[str] = []
         self.unit = self._find_unit()
-        self._terms = {group.name: [self._reader(term) for term in group.terms] for group in contract.groups}
+        self._readers = {group.name: [self._reader(term) for term in group.terms] for group in contract.groups}
         for group in contract.groups:
             self._check_group(group)
         if self._problems:
@@ -82,13 +234,13 @@ class Observations:
             if group.image is not None:
                 found[group.input] = self._stacked(group, snapshot)
             else:
-                parts = [self._term(group.name, each, snapshot) for each in self._terms[group.name]]
+                pairs = zip(group.terms, self._readers[group.name], strict=True)
+                parts = [self._numbers(group.name, term, read(snapshot)) for term, read in pairs]
                 found[group.input] = np.concatenate(parts)[None]
         return found
 
-    def _term(self, group: str, each: _Read, snapshot: Snapshot) -> np.ndarray:
-        term = each.term
-        value: np.ndarray = np.atleast_1d(np.asarray(each.read(snapshot), dtype=np.float32)) - term.offset
+    def _numbers(self, group: str, term: Term, quantity: np.ndarray | float) -> np.ndarray:
+        value: np.ndarray = np.atleast_1d(np.asarray(quantity, dtype=np.float32)) - term.offset
         if term.clip is not None:
             value = np.clip(value, *term.clip)
         value = value * term.scale
@@ -103,22 +255,20 @@ class Observations:
     def _stacked(self, group: Group, snapshot: Snapshot) -> np.ndarray:
         assert group.image is not None
         image, past = snapshot.images[group.name], self._past.get(group.name)
-        if past is None:
-            past = np.tile(image, (group.image.frames, 1, 1))
-        else:
-            past = np.concatenate([image, past[: -len(image)]])
+        past = (
+            np.tile(image, (group.image.frames, 1, 1)) if past is None else np.concatenate([image, past[: -len(image)]])
+        )
         self._past[group.name] = past
         return past[None]
 
     def _find_unit(self) -> Frame | None:
         found: dict[tuple[str, str], Frame] = {}
-        for group in self._contract.groups:
-            for term in group.terms:
-                if term.library and term.quantity in OF_UNIT and term.frame is not None:
-                    found[term.frame.body, term.frame.name] = term.frame
+        for term in (term for group in self._contract.groups for term in group.terms):
+            if term.library and term.quantity in OF_UNIT and term.frame is not None:
+                found[term.frame.body, term.frame.name] = term.frame
         if len(found) > 1:
-            there = ", ".join(f"{name} on {body}" for body, name in found)
-            self._problems.append(f"it has several inertial measurement units ({there}), the node reads one")
+            units = ", ".join(f"{name} on {body}" for body, name in found)
+            self._problems.append(f"it has several inertial measurement units ({units}), the node reads one")
         return next(iter(found.values()), None)
 
     def _check_group(self, group: Group) -> None:
@@ -133,12 +283,12 @@ class Observations:
             f"the images of {group.name} have the channels {', '.join(image.channels)}, the node reads red, green, blue or grey"
         )
 
-    def _reader(self, term: Term) -> _Read:
+    def _reader(self, term: Term) -> Reader:
         try:
-            return _Read(term, self._measured(term))
+            return self._measured(term)
         except Refused as problem:
             self._problems.append(f"{term.name}: {problem}")
-            return _Read(term, lambda snapshot: np.zeros(len(term.names), np.float32))
+            return lambda snapshot: 0.0
 
     def _measured(self, term: Term) -> Reader:
         """The reader of a term's quantity. Raises Refused with the missing input."""
@@ -216,25 +366,9 @@ class Observations:
         raise Refused(f"{term.quantity} is none of the actions that the node keeps")
 
 
-class Drawn(Protocol):
-    """A command, by the function that draws it in training."""
-
-    @property
-    def quantity(self) -> str: ...
-    @property
-    def library(self) -> bool: ...
-
-
-def is_twist(command: Drawn) -> bool:
-    """Whether a command comes as a ``geometry_msgs/Twist``; else as a ``std_msgs/Float64MultiArray``."""
-    return command.library and command.quantity in VELOCITIES
-
-
-def needed_topics(found: Observations) -> Mapping[str, str]:
-    """Topics of the node's inputs, and the purpose of each."""
-    topics = {name: "measured" for name in (JOINTS, IMU, ODOMETRY) if name in found.needs}
-    topics |= {command_topic(command): f"command {name}" for name, command in found.commands.items()}
-    return topics | {image_topic(name): f"image {name}" for name in found.images}
+def is_twist(command: Any) -> bool:
+    """Whether a command of the contract comes as a ``geometry_msgs/Twist``; else as a ``std_msgs/Float64MultiArray``."""
+    return bool(command.library) and command.quantity in VELOCITIES
 
 
 def command_topic(command: Command) -> str:

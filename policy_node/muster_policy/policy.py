@@ -37,13 +37,13 @@ class Policy:
         except Exception as error:  # onnxruntime's own classes have no common base
             reason = " ".join(str(error).split())
             raise Refused(f"{bundle.path}: policy.onnx can't be run by onnxruntime: {reason[:200]}") from None
-        given = {each.name: tuple(each.shape[1:]) for each in self._session.get_inputs()}
-        wanted = {each.input: each.shape for each in contract.groups} | {
+        inputs = {each.name: tuple(each.shape[1:]) for each in self._session.get_inputs()}
+        described = {each.input: each.shape for each in contract.groups} | {
             each.name: each.shape for each in contract.states
         }
-        if given != wanted:
+        if inputs != described:
             raise Refused(
-                f"{bundle.path}: policy.onnx takes {given}, contract.json says {wanted}; export the policy again"
+                f"{bundle.path}: policy.onnx takes {inputs}, contract.json says {described}; export the policy again"
             )
         self._outputs = ["actions", *(state.output for state in contract.states)]
         self._states: dict[str, np.ndarray] = {}
@@ -71,9 +71,9 @@ class Policy:
         """
         try:
             with np.load(io.BytesIO(parity), allow_pickle=False) as archive:
-                told = {name: archive[name] for name in archive.files}
-            begins, wanted = told["begins"], told["actions"]
-            inputs = {group.input: told[group.input] for group in self._contract.groups}
+                arrays = {name: archive[name] for name in archive.files}
+            begins, trained = arrays["begins"], arrays["actions"]
+            inputs = {group.input: arrays[group.input] for group in self._contract.groups}
         except (ValueError, OSError, KeyError) as error:
             raise Refused(f"{self._where}: parity.npz can't be read ({error}); export the policy again") from None
         greatest = 0.0
@@ -83,7 +83,7 @@ class Policy:
                 state[fresh] = 0.0
             actions = self.act({name: np.ascontiguousarray(each[step]) for name, each in inputs.items()})
             with np.errstate(invalid="ignore"):
-                apart = np.abs(actions - wanted[step]) / np.maximum(1.0, np.abs(wanted[step]))
+                apart = np.abs(actions - trained[step]) / np.maximum(1.0, np.abs(trained[step]))
             greatest = max(greatest, float(np.nan_to_num(apart, nan=np.inf).max()))
         self.reset()
         if not greatest <= TOLERANCE:

@@ -69,11 +69,8 @@ class Runner:
         self._silent: set[str] = set()
         self._settled = -float("inf")
         """Time from which inputs count as settled [s, monotonic]."""
-        self._topics: Mapping[str, str] = {}
-
-    def name_topics(self, topics: Mapping[str, str]) -> None:
-        """Give the full names of the inputs' topics, for the lines."""
-        self._topics = topics
+        self.topics: Mapping[str, str] = {}
+        """Full names of the inputs' topics, for the lines."""
 
     def step(self, now: float, due: bool = True) -> bool:
         """Do one control step.
@@ -85,7 +82,7 @@ class Runner:
         Returns:
             Whether a command was given.
         """
-        self.inputs.update(self._topics)
+        self.inputs.update(self.topics)
         for line in self.inputs.complaints():
             self._say(line, True)
         if self.mode in (Mode.STOPPED, Mode.ENDED) or self.inputs.missing():
@@ -98,7 +95,7 @@ class Runner:
             if self.counts.stops:
                 self._settled = now + SETTLED
             return False
-        if slow := self.inputs.too_slow(now):
+        if slow := [each for each in self.inputs.all if each.is_too_slow(now)]:
             if self.mode is Mode.ACTING:
                 why = f"{self._topic(slow[0].topic)} asks for less than any command in training"
                 self._stop(why, "when that ends")
@@ -127,7 +124,7 @@ class Runner:
         self.mode = Mode.ENDED
 
     def _act(self, now: float) -> bool:
-        silent = {each.topic for each in self.inputs.silent_commands(now)}
+        silent = {each.topic for each in self.inputs.all if each.is_silent(now)}
         for topic in sorted(silent - self._silent):
             self._say(f"{self._topic(topic)} is silent: the command is velocity 0", True)
         self._silent = silent
@@ -167,4 +164,4 @@ class Runner:
         self.observations.reset()
 
     def _topic(self, topic: str) -> str:
-        return self._topics.get(topic, topic)
+        return self.topics.get(topic, topic)

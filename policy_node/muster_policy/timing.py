@@ -1,9 +1,12 @@
-"""A steady loop, and statistics of its timing."""
+"""A steady loop: its clock, statistics of its timing, and lines that are printed without stopping it."""
 
 from __future__ import annotations
 
+import queue
+import threading
 import time
 from collections import deque
+from collections.abc import Callable
 
 import numpy as np
 
@@ -32,23 +35,47 @@ class Figures:
         """Add a time [s]."""
         self._kept.setdefault(name, deque(maxlen=KEPT)).append(seconds)
 
-    def percentiles(self, name: str) -> tuple[float, float, float] | None:
-        """Median, 99th percentile and maximum [s]; None without times."""
-        kept = self._kept.get(name)
-        if not kept:
-            return None
-        median, most, greatest = np.percentile(np.fromiter(kept, float), [50, 99, 100])
-        return float(median), float(most), float(greatest)
-
     def line(self) -> str:
-        """All of them as text [ms]."""
+        """Median, 99th percentile and maximum of each kind as text [ms]."""
         parts = []
-        for name in self._kept:
-            found = self.percentiles(name)
-            if found:
-                parts.append(f"{name} p50 {found[0] * 1e3:.3f}, p99 {found[1] * 1e3:.3f}, max {found[2] * 1e3:.2f} ms")
+        for name, kept in self._kept.items():
+            median, most, greatest = 1e3 * np.percentile(np.fromiter(kept, float), [50, 99, 100])
+            parts.append(f"{name} p50 {median:.3f}, p99 {most:.3f}, max {greatest:.2f} ms")
         return "; ".join(parts) or "no step yet"
 
-    def clear(self) -> None:
-        """Delete all times."""
-        self._kept.clear()
+
+MOST = 1_000
+"""Greatest number of waiting lines; later ones are dropped."""
+
+
+class Lines:
+    """Passes lines to a thread that prints them.
+
+    Args:
+        tell: Called with each line.
+    """
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell = tell
+        self._waiting: queue.Queue[str | None] = queue.Queue(MOST)
+        self._thread = threading.Thread(target=self._work, name="lines", daemon=True)
+        self._thread.start()
+
+    def say(self, line: str) -> None:
+        """Queue a line for printing; does not wait."""
+        try:
+            self._waiting.put_nowait(line)
+        except queue.Full:
+            pass  # no output is possible
+
+    def close(self) -> None:
+        """Wait until all lines are printed, a second at most."""
+        try:
+            self._waiting.put_nowait(None)
+        except queue.Full:
+            return
+        self._thread.join(1.0)
+
+    def _work(self) -> None:
+        while (line := self._waiting.get()) is not None:
+            self._tell(line)

@@ -22,19 +22,15 @@ class Qos:
 
     Attributes:
         depth: Number of messages to keep.
-        best_effort: Whether messages may be lost; else reliable.
         transient_local: Whether late subscribers get the last messages; else volatile.
     """
 
     depth: int = 10
-    best_effort: bool = False
     transient_local: bool = False
 
     def __str__(self) -> str:
         """``reliability:durability:history,depth:deadline:lifespan:liveliness``, with what is default left out."""
-        reliability, durability = "2" if self.best_effort else "", "1" if self.transient_local else ""
-        depth = "" if self.depth == 42 else str(self.depth)
-        return f"{reliability}:{durability}:,{depth}:,:,:,,"
+        return f":{'1' if self.transient_local else ''}:,{self.depth}:,:,:,,"
 
 
 @dataclass(frozen=True)

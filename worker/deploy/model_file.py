@@ -1,23 +1,31 @@
-"""The model file of an exported policy, ONNX or TorchScript, which other programs run; and such a file as a policy again."""
+"""The model file of an exported policy, ONNX or TorchScript, which other programs run, its description for LEAPP; and such a file as a policy
+again."""
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
+import platform
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import onnx
 import torch
+import yaml
 from tensordict import TensorDict
 
-from shared_store.contract.policy import Contract
+from shared_store import __version__
+from shared_store.contract.policy import Contract, Group
+from shared_store.volume.bundles import CONTRACT
 
 if TYPE_CHECKING:
     from worker.learning.algorithm import ExportedPolicy
+
 
 OPSET = 18
 
@@ -90,9 +98,8 @@ class OnnxPolicy:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = options.inter_op_num_threads = (
-            1  # faster for small networks, and the same each time
-        )
+        # faster for small networks, and the same each time
+        options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 3
         source = model if isinstance(model, bytes) else str(model)
         self._session = onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
@@ -109,14 +116,16 @@ class OnnxPolicy:
         """Actions for the inputs by name, each of shape (n, …); shape (n, actions)."""
         if not self._states:
             count = len(next(iter(inputs.values())))
-            self._states = {
-                state.name: np.zeros((count, *state.shape), dtype=np.float32) for state in self._contract.states
-            }
-        outputs = ["actions", *(state.output for state in self._contract.states)]
-        actions, *states = self._session.run(outputs, {**inputs, **self._states})
+            self._states = {state.name: np.zeros((count, *state.shape), np.float32) for state in self._contract.states}
+        actions, *states = self._outputs({**inputs, **self._states})
         self._states = dict(zip(self._states, states, strict=True))
-        found: np.ndarray = actions
-        return found
+        return actions
+
+    def _outputs(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        """Actions and next states."""
+        names = ["actions", *(state.output for state in self._contract.states)]
+        outputs: list[np.ndarray] = self._session.run(names, dict(inputs))
+        return outputs
 
     def reset(self, worlds: torch.Tensor | np.ndarray | None = None) -> None:
         """Forget the recurrent state of all worlds, or where ``worlds``, shape (n,), bool, is true."""
@@ -138,16 +147,82 @@ class ScriptPolicy(OnnxPolicy):
         self._states = {}
 
     @torch.no_grad()
-    def run(self, inputs: Mapping[str, np.ndarray]) -> np.ndarray:
-        """See :meth:`OnnxPolicy.run`."""
-        count = len(next(iter(inputs.values())))
-        if not self._states:
-            self._states = {
-                state.name: np.zeros((count, *state.shape), dtype=np.float32) for state in self._contract.states
+    def _outputs(self, inputs: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+        names = [*(group.input for group in self._contract.groups), *self._states]
+        outputs = self._module(*(torch.from_numpy(inputs[name]) for name in names))
+        return [each.numpy().copy() for each in (outputs if isinstance(outputs, tuple) else (outputs,))]
+
+
+LEAPP = "leapp.yaml"
+_VERSION = "1.3"
+"""Of LEAPP's format."""
+_NODE = "policy"
+
+
+def leapp_description(model: bytes, contract: Contract) -> str:
+    """``leapp.yaml`` for ``policy.onnx`` beside it.
+
+    Tensors are as the file has them, with a batch of 1. Names are given to the numbers of observations and actions; a ``kind`` to none:
+    LEAPP's kinds are quantities of a robot, and the policy's numbers become these only by the scales and offsets of the contract.
+
+    Args:
+        model: Content of ``policy.onnx``.
+        contract: Of the policy.
+    """
+    graph = onnx.load_from_string(model).graph
+    names: dict[str, list[str]] = {group.input: list(_numbers(group)) for group in contract.groups if group.terms}
+    if not contract.discrete:
+        names["actions"] = list(contract.action_names)
+    fed_back = {state.output: state.name for state in contract.states}
+    outputs = [_tensor(each, names) for each in graph.output]
+    inputs = [_tensor(each, names) for each in graph.input]
+    # LEAPP asks for both, and trusts the second
+    digests = {"md5sum": hashlib.md5(model, usedforsecurity=False), "sha256sum": hashlib.sha256(model)}
+    parameters = {"model_path": "policy.onnx", "backend": "onnx", "opset_version": OPSET, "warp_segments": 0}
+    document = {
+        "models": {
+            _NODE: {
+                "inputs": inputs,
+                "outputs": outputs,
+                "parameters": parameters | {name: digest.hexdigest() for name, digest in digests.items()},
             }
-        given = [*(inputs[group.input] for group in self._contract.groups), *self._states.values()]
-        outputs = self._module(*(torch.from_numpy(each) for each in given))
-        actions, *states = outputs if isinstance(outputs, tuple) else (outputs,)
-        self._states = {name: state.numpy().copy() for name, state in zip(self._states, states, strict=True)}
-        found: np.ndarray = actions.numpy()
-        return found
+        },
+        "pipeline": {
+            "configs": {"frequency": contract.control_hz, "contract": CONTRACT},
+            "inputs": {_NODE: [each["name"] for each in inputs if each["name"] not in fed_back.values()]},
+            "outputs": {_NODE: [each["name"] for each in outputs if each["name"] not in fed_back]},
+            "data_flow": {},
+            "feedback_flow": {f"{_NODE}/{output}": [f"{_NODE}/{name}"] for output, name in fed_back.items()},
+        },
+        "system information": {
+            "leapp config version": _VERSION,
+            "written by": f"muster {__version__}",
+            "python version": platform.python_version(),
+            "torch version": str(torch.__version__),
+        },
+    }
+    text: str = yaml.safe_dump(document, sort_keys=False, width=120)
+    return text
+
+
+def _tensor(value: onnx.ValueInfoProto, names: dict[str, list[str]]) -> dict[str, Any]:
+    kind = value.type.tensor_type
+    shape = [each.dim_value or 1 for each in kind.shape.dim]  # the batch is free
+    described: dict[str, Any] = {
+        "name": value.name,
+        "dtype": onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type).name,
+        "shape": shape,
+        "type": "tensor",
+    }
+    known = names.get(value.name)
+    if known and shape == [1, len(known)]:
+        described["element_names"] = [None, known]
+    return described
+
+
+def _numbers(group: Group) -> Iterator[str]:
+    """A name for each number of a group; of a history, those of earlier steps with the steps since then."""
+    for term in group.terms:
+        for ago in range(term.history - 1, -1, -1):
+            for name in term.names:
+                yield f"{term.name}/{name}" + (f"[-{ago}]" if ago else "")

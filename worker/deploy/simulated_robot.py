@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 Message = tuple[str, str, Any]
 """Topic, ROS type and message."""
+JOINT_STATE = "sensor_msgs/msg/JointState"
 PATIENCE = 5.0
 """Seconds between two lines while no commands arrive."""
 NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
@@ -58,26 +59,27 @@ class SimulatedRobot:
 
     def measured(self, nanoseconds: int) -> list[Message]:
         """Its sensors' present values, the joint states last: a policy that acts on their arrival has all the others."""
+        from muster_policy.observations import image_topic
+
         found: list[Message] = []
         if self._view.root_coordinate >= 0:
             found += self._root(nanoseconds)
         found += self._commands()
         for group in self.contract.groups:
             if group.image is not None:
-                topic = "image_raw" if group.name == "policy" else f"{group.name}/image_raw"
-                found.append((topic, "sensor_msgs/msg/Image", self._image(group.name, len(group.image.channels))))
-        header, view, arrays = self.messages.header(nanoseconds), self._view, self.task.worlds.arrays
+                image = self._image(group.name, len(group.image.channels))
+                found.append((image_topic(group.name), "sensor_msgs/msg/Image", image))
+        view, arrays = self._view, self.task.worlds.arrays
         positions = arrays.joint_q.numpy()[0, view.coordinates] + self._arrays.encoder_bias.numpy()[0]
         joints = self.messages.make(
-            "sensor_msgs/msg/JointState",
-            header=header,
+            JOINT_STATE,
+            header=self.messages.header(nanoseconds),
             name=list(view.joint_names),
             position=positions.astype(np.float64),
             velocity=arrays.joint_qd.numpy()[0, view.dofs].astype(np.float64),
             effort=np.zeros(0),
         )
-        found.append(("joint_states", "sensor_msgs/msg/JointState", joints))
-        return found
+        return [*found, ("joint_states", JOINT_STATE, joints)]
 
     def actions(self, names: list[str], values: np.ndarray, before: torch.Tensor) -> torch.Tensor:
         """The task's actions that joint commands stand for, shape ``(1, actions)``.
@@ -95,61 +97,54 @@ class SimulatedRobot:
 
     def _root(self, nanoseconds: int) -> list[Message]:
         """IMU and odometry from the pose and velocities of the free root."""
-        make, view, arrays = self.messages.make, self._view, self.task.worlds.arrays
+        from muster_policy.observations import matrix
+
+        make, header, vector = self.messages.make, self.messages.header, self.messages.vector
+        view, arrays, coms = self._view, self.task.worlds.arrays, self.task.worlds.model.body_com
         pose = arrays.joint_q.numpy()[0, view.root_coordinate : view.root_coordinate + 7].astype(np.float64)
         velocity = arrays.joint_qd.numpy()[0, view.root_dof : view.root_dof + 6].astype(np.float64)
-        coms = self.task.worlds.model.body_com
         assert coms is not None
         com = coms.numpy().reshape(-1, 3)[view.root_body].astype(np.float64)
-        turn = _matrix(pose[3:])
+        turn, zeros = matrix(pose[3:]), np.zeros(9)
         angular = turn.T @ velocity[3:]
         linear = turn.T @ velocity[:3] - np.cross(angular, com)
-        mount, zeros = _matrix(self._mount), np.zeros(9)
-        header = self.messages.header(nanoseconds, "imu")
         imu = make(
             "sensor_msgs/msg/Imu",
-            header=header,
+            header=header(nanoseconds, "imu"),
             orientation=self.messages.quaternion(_times(pose[3:], self._mount)),
             orientation_covariance=zeros,
-            angular_velocity=self.messages.vector(mount.T @ angular),
+            angular_velocity=vector(matrix(self._mount).T @ angular),
             angular_velocity_covariance=zeros,
-            linear_acceleration=self.messages.vector(np.zeros(3)),
+            linear_acceleration=vector(np.zeros(3)),
             linear_acceleration_covariance=NOT_MEASURED,
         )
         x, y, z = pose[:3].tolist()
-        placed = make(
-            "geometry_msgs/msg/Pose",
-            position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
-            orientation=self.messages.quaternion(pose[3:]),
-        )
+        position = make("geometry_msgs/msg/Point", x=x, y=y, z=z)
+        placed = make("geometry_msgs/msg/Pose", position=position, orientation=self.messages.quaternion(pose[3:]))
+        twist = self.messages.twist(linear, angular)
         odometry = make(
             "nav_msgs/msg/Odometry",
-            header=self.messages.header(nanoseconds, "odom"),
+            header=header(nanoseconds, "odom"),
             child_frame_id=view.body_names[0],
             pose=make("geometry_msgs/msg/PoseWithCovariance", pose=placed, covariance=np.zeros(36)),
-            twist=make(
-                "geometry_msgs/msg/TwistWithCovariance",
-                twist=self.messages.twist(linear, angular),
-                covariance=np.zeros(36),
-            ),
+            twist=make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )
         return [("imu", "sensor_msgs/msg/Imu", imu), ("odom", "nav_msgs/msg/Odometry", odometry)]
 
     def _commands(self) -> list[Message]:
-        from muster_policy.observations import is_twist
+        from muster_policy.observations import command_topic, is_twist
 
         found: list[Message] = []
-        described = {command.name: command for command in self.contract.commands}
+        described: dict[str, Any] = {command.name: command for command in self.contract.commands}
         for name, first in self.task.plan.binder.commands.items():
             command = described[name]
             memory = self.task.state_tensors()["memory"][0, first : first + len(command.names)]
             numbers = memory.double().tolist()
             if is_twist(command):
                 twist = self.messages.twist((*numbers[:2], 0.0), (0.0, 0.0, numbers[2]))
-                found.append(("cmd_vel", "geometry_msgs/msg/Twist", twist))
+                found.append((command_topic(command), "geometry_msgs/msg/Twist", twist))
             else:
-                array = self.messages.array(numbers)
-                found.append((f"commands/{command.name}", "std_msgs/msg/Float64MultiArray", array))
+                found.append((command_topic(command), "std_msgs/msg/Float64MultiArray", self.messages.array(numbers)))
         return found
 
     def _image(self, group: str, channels: int) -> Any:
@@ -167,14 +162,6 @@ class SimulatedRobot:
         )
 
 
-def _matrix(rotation: np.ndarray) -> np.ndarray:
-    """Rotation matrix of a quaternion xyzw."""
-    axis, w = rotation[:3], float(rotation[3])
-    skew = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    found: np.ndarray = np.eye(3) + 2.0 * w * skew + 2.0 * skew @ skew
-    return found
-
-
 def _times(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Product of two quaternions xyzw."""
     a, b = first[:3], second[:3]
@@ -183,7 +170,7 @@ def _times(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def play(
-    robot: SimulatedRobot, node: Any, episodes: int, speed: float = 1.0, told: Callable[[str], None] = print
+    robot: SimulatedRobot, node: Any, episodes: int, speed: float = 1.0, report: Callable[[str], None] = print
 ) -> list[float]:
     """Be a robot on the network until so many episodes have ended.
 
@@ -192,7 +179,7 @@ def play(
         node: A :class:`muster_policy.graph.Node`.
         episodes: How many.
         speed: Simulated seconds in a second.
-        told: Called with each line.
+        report: Called with each line.
 
     Returns:
         Return of each episode.
@@ -202,7 +189,7 @@ def play(
     newest: list[tuple[list[str], np.ndarray]] = []
 
     def commanded(data: bytes, kind: str, type_hash: str) -> None:
-        message = messages.decode(data, "sensor_msgs/msg/JointState")
+        message = messages.decode(data, JOINT_STATE)
         values = next(each for each in (message.position, message.velocity, message.effort) if len(each))
         newest.append((list(message.name), values))
 
@@ -211,32 +198,33 @@ def play(
             publishers[topic] = node.publisher(topic, kind)
         publishers[topic].publish(message)
 
-    node.subscribe("joint_commands", "sensor_msgs/msg/JointState", commanded)
+    node.subscribe("joint_commands", JOINT_STATE, commanded)
     empty = messages.make("std_msgs/msg/Empty", structure_needs_at_least_one_member=0)
     reset = node.publisher("/muster_policy/reset", "std_msgs/msg/Empty")
     period = 1.0 / task.config.control_hz
     actions, total, late, steps = torch.zeros_like(task.actions), 0.0, 0, 0
     returns: list[float] = []
-    simulated = 0
-    begun = False
+    simulated, is_commanded = 0, False
     deadline = time.monotonic()
     patience = deadline + PATIENCE
     while len(returns) < episodes:
         simulated += round(period * 1e9)
         clock = messages.make("rosgraph_msgs/msg/Clock", clock=messages.stamp(simulated))
-        publish("/clock", "rosgraph_msgs/msg/Clock", clock)
-        for message in robot.measured(time.time_ns()):
+        for message in (("/clock", "rosgraph_msgs/msg/Clock", clock), *robot.measured(time.time_ns())):
             publish(*message)
         deadline = max(deadline + period / speed, time.monotonic())
         time.sleep(max(0.0, deadline - time.monotonic()))
-        if not newest and not begun:  # no commands yet
-            if time.monotonic() > patience:
-                patience = time.monotonic() + PATIENCE
-                told("no joint_commands yet; is a policy node there, and on the same router? muster-policy BUNDLE")
-            continue
-        if not begun:
-            begun = True
-            told("the first command has come")
+        if not is_commanded:
+            if newest:
+                is_commanded = True
+                report("the first command has come")
+            else:
+                if time.monotonic() > patience:
+                    patience = time.monotonic() + PATIENCE
+                    report(
+                        "no joint_commands yet; is a policy node there, and on the same router? muster-policy BUNDLE"
+                    )
+                continue
         late += not newest
         while newest:
             actions = robot.actions(*newest.pop(0), actions)
@@ -245,14 +233,13 @@ def play(
         total += float(task.rewards[0])
         if bool(task.dones[0]):
             returns.append(total)
-            told(
-                f"episode {len(returns)} of {episodes}: return {total:.2f}, {counted(steps, 'step')}, {late} without a new command"
-            )
+            lateness = f"{counted(steps, 'step')}, {late} without a new command"
+            report(f"episode {len(returns)} of {episodes}: return {total:.2f}, {lateness}")
             total, late, steps = 0.0, 0, 0
             actions = torch.zeros_like(actions)
             newest.clear()
             reset.publish(empty)
-    told(f"mean return {np.mean(returns):.2f} of {counted(len(returns), 'episode')}")
+    report(f"mean return {np.mean(returns):.2f} of {counted(len(returns), 'episode')}")
     return returns
 
 
@@ -292,20 +279,18 @@ def main() -> int:
         epilog="example: muster-policy cart-policy --listen tcp/localhost:7447 & python -m worker.deploy.simulated_robot cart-policy",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("bundle", type=Path, help="directory of a bundle")
-    parser.add_argument(
-        "--accept-changed-robot",
-        action="store_true",
-        help="go on where the robot's file loads otherwise than in the training",
-    )
-    parser.add_argument("--episodes", type=int, default=10, help="end after so many (default: 10)")
-    parser.add_argument("--speed", type=float, default=1.0, help="simulated seconds in a second (default: 1)")
-    parser.add_argument("--seed", type=int, default=0, help="of the world (default: 0)")
-    parser.add_argument("--connect", default="tcp/localhost:7447", help="the router (default: tcp/localhost:7447)")
-    parser.add_argument("--listen", default=None, help="be a router on this endpoint")
-    parser.add_argument("--domain", type=int, default=0, help="ROS domain (default: 0)")
-    given = parser.parse_args()
-    if given.episodes < 1 or not 0.0 < given.speed <= 100.0:
+    add = parser.add_argument
+    add("bundle", type=Path, help="directory of a bundle")
+    accept = "go on where the robot's file loads otherwise than in the training"
+    add("--accept-changed-robot", action="store_true", help=accept)
+    add("--episodes", type=int, default=10, help="end after so many (default: 10)")
+    add("--speed", type=float, default=1.0, help="simulated seconds in a second (default: 1)")
+    add("--seed", type=int, default=0, help="of the world (default: 0)")
+    add("--connect", default="tcp/localhost:7447", help="the router (default: tcp/localhost:7447)")
+    add("--listen", default=None, help="be a router on this endpoint")
+    add("--domain", type=int, default=0, help="ROS domain (default: 0)")
+    options = parser.parse_args()
+    if options.episodes < 1 or not 0.0 < options.speed <= 100.0:
         raise UserError("--episodes must be 1 or more, --speed above 0 and at most 100")
     try:
         from muster_policy.errors import Refused
@@ -315,14 +300,14 @@ def main() -> int:
         raise UserError(f"{error.name} is not installed; pip install ./policy_node") from error
     warp.config.log_level = warp.LOG_WARNING  # not a line for each kernel module
     messages = Messages()
-    robot = open_robot(given.bundle, messages, given.seed, accept=given.accept_changed_robot)
+    robot = open_robot(options.bundle, messages, options.seed, accept=options.accept_changed_robot)
     try:
-        connect = None if given.listen else given.connect
-        with open_session(connect, given.listen) as session:
-            node = Node(session, messages, given.domain, "/", "simulated_robot")
+        connect = None if options.listen else options.connect
+        with open_session(connect, options.listen) as session:
+            node = Node(session, messages, options.domain, "/", "simulated_robot")
             print(f"simulated robot of {robot.contract.task}: it waits for joint_commands", flush=True)
             try:
-                play(robot, node, given.episodes, given.speed, lambda line: print(line, flush=True))
+                play(robot, node, options.episodes, options.speed, lambda line: print(line, flush=True))
             finally:
                 node.close()
     except Refused as error:

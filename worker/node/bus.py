@@ -1,7 +1,7 @@
 """The node's end of the bus: its presence, its progress, its log while somebody follows it, and the commands that reach it.
 
 Only the supervisor speaks on the bus; training knows nothing of it, so a bus that is off, slow or restarted can't be noticed
-there. Nothing in here waits: a router that is away is tried again, and what is put meanwhile is lost, which is allowed.
+there. Nothing in here waits: a router that can't be reached is tried again, and what is put meanwhile is lost, which is allowed.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class NodeBus:
     def tend(self, progress: dict[str, Any] | None, log_end: Callable[[], int | None] = lambda: None) -> None:
         """Open the session where there is none yet, and publish ``progress`` once a second: an empty one, too, is a sign of life.
 
-        ``log_end``: the end of the node's log [bytes], which followers of it are told; None where it is unknown.
+        ``log_end``: the end of the node's log [bytes], which its followers get; None where it is unknown.
         """
         now = time.monotonic()
         if self.contract.bus is None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import errno
 import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections import deque
 from collections.abc import Sequence
@@ -19,6 +22,7 @@ from shared_store.process.tether import tied
 from shared_store.volume.files import DamagedFile, json_object, read_json
 from shared_store.volume.node_outcomes import FirstError
 
+_PR_SET_CHILD_SUBREAPER = 36
 _LONGEST_LINE = 65536
 """Bytes after which a line without an end is cut, so that a program that never prints a newline can't fill the memory."""
 _LONGEST_MESSAGE = 65536
@@ -53,7 +57,7 @@ class Rank:
         self.stalled: str | None = None
         """Its stacks when it had made no progress for too long."""
         self.progress: dict[str, Any] = {}
-        """The newest of everything that it told (:class:`worker.learning.reporter.Beacon`)."""
+        """The newest of everything that it reported (:class:`worker.learning.reporter.Beacon`)."""
         self.heard: float | None = None
         """Time of its last message about an iteration (monotonic [s]); None before the first and after the last iteration."""
         self.spoke = time.monotonic()
@@ -139,7 +143,10 @@ class Rank:
         self.running, self.ended = False, time.time()
         self.exit_code = code if code >= 0 else 128 - code
         if code < 0:
-            self.signal_name = _signal_name(-code)
+            try:
+                self.signal_name = signal.Signals(-code).name
+            except ValueError:  # a real-time signal
+                self.signal_name = f"signal {-code}"
         return True
 
     def give_up(self, stuck: str) -> None:
@@ -174,7 +181,7 @@ class Rank:
         *lines, self._beacon = (self._beacon + chunk).split(b"\n")
         if len(self._beacon) > _LONGEST_MESSAGE:
             self._beacon = _TOO_LONG
-        said = []
+        reports = []
         self.spoke = time.monotonic()
         for line in lines:
             if line.startswith(_TOO_LONG) or len(line) > _LONGEST_MESSAGE:
@@ -191,17 +198,14 @@ class Rank:
             if message.get("done"):
                 self.heard = None
             if "said" in message:
-                said.append(str(message.pop("said"))[:_LONGEST_VALUE])
-            self._note(message)
-        return said
-
-    def _note(self, message: dict[str, Any]) -> None:
-        for name, value in message.items():
-            known = name in self.progress or (len(self.progress) < _MOST_VALUES and len(name) <= _LONGEST_VALUE)
-            if known and isinstance(value, str):
-                self.progress[name] = value[:_LONGEST_VALUE]
-            elif known and (value is None or (isinstance(value, int | float) and abs(value) < _LARGEST_NUMBER)):
-                self.progress[name] = value
+                reports.append(str(message.pop("said"))[:_LONGEST_VALUE])
+            for name, value in message.items():
+                known = name in self.progress or (len(self.progress) < _MOST_VALUES and len(name) <= _LONGEST_VALUE)
+                if known and isinstance(value, str):
+                    self.progress[name] = value[:_LONGEST_VALUE]
+                elif known and (value is None or (isinstance(value, int | float) and abs(value) < _LARGEST_NUMBER)):
+                    self.progress[name] = value
+        return reports
 
     def rest(self, stream: str) -> str:
         """The output after the last newline."""
@@ -262,8 +266,52 @@ class Rank:
         return FirstError(self.number, last, "", self.ended) if last and self.exit_code else None
 
 
-def _signal_name(number: int) -> str:
+def adopt_orphans() -> None:
+    """Have descendants whose parent dies re-parented to this process instead of to init, so that they can be found (``prctl(2)``)."""
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
+
+
+def kill_group(pid: int, number: int) -> None:
+    """Send signal ``number`` to the process group that ``pid`` leads, where it still exists."""
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(pid, number)
+
+
+_SECONDS = 15.0
+
+
+def state_of(pid: int) -> str:
+    """The kernel's word for what the process does: ``R`` runs, ``S`` sleeps, ``D`` waits for a device, ``T`` is stopped, ``Z`` is dead."""
     try:
-        return signal.Signals(number).name
-    except ValueError:  # a real-time signal
-        return f"signal {number}"
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return "Z"
+
+
+def dump_stacks(pid: int, *, speaks: bool = False) -> list[str]:
+    """The stacks of every thread of ``pid`` as lines.
+
+    py-spy reads them through ptrace, with native frames where the process can be paused. Where that is not allowed, a process of
+    ours (``speaks``) is asked to print its own Python stacks on stderr (SIGUSR1, ``faulthandler``); others keep their secret.
+    """
+    spy = Path(sys.executable).parent / "py-spy"
+    stopped = state_of(pid) in "Tt"
+    # a stopped process can't be paused once more; it holds still anyway
+    variants = [["--nonblocking"]] if stopped else [["--native"], [], ["--nonblocking"]]
+    problem = f"{spy} is not installed"
+    for options in variants if spy.exists() else []:
+        try:
+            command = [str(spy), "dump", *options, "--pid", str(pid)]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=_SECONDS)
+        except (OSError, subprocess.TimeoutExpired) as error:
+            problem = str(error)
+            continue
+        if done.returncode == 0:
+            return [line for line in done.stdout.splitlines() if line.strip()]
+        problem = next((line.strip() for line in reversed(done.stderr.splitlines()) if line.strip()), problem)
+    if speaks and not stopped:
+        os.kill(pid, signal.SIGUSR1)
+        return [
+            f"stacks could not be read from outside ({problem}); the process was asked to print its Python stacks itself"
+        ]
+    return [f"stacks could not be read ({problem})"]

@@ -7,7 +7,6 @@ first task is the main node, the others follow in the order of their index. Impo
 
 from __future__ import annotations
 
-import dataclasses
 import ipaddress
 import json
 import os
@@ -22,14 +21,14 @@ from typing import Any, NoReturn
 from shared_store.contract.node import NodeContract, sealed
 from shared_store.process.ports import free_port
 from shared_store.process.shim import shimmed
-from worker.node.network import address_towards
+from worker.node.surroundings import address_towards
 
 
 def meet() -> str:
     """The address at which the nodes of this job meet. Raises OSError where an address or a port can't be found."""
     names = _lines("scontrol", "show", "hostnames", os.environ["SLURM_JOB_NODELIST"])
-    told = "\n".join(_lines("scontrol", "--oneliner", "show", "node", os.environ["SLURM_JOB_NODELIST"]))
-    by_name = {m[1]: m[2] for m in re.finditer(r"^NodeName=(\S+) .*?NodeAddr=(\S+)", told, re.MULTILINE)}
+    facts = "\n".join(_lines("scontrol", "--oneliner", "show", "node", os.environ["SLURM_JOB_NODELIST"]))
+    by_name = {m[1]: m[2] for m in re.finditer(r"^NodeName=(\S+) .*?NodeAddr=(\S+)", facts, re.MULTILINE)}
     addresses = [socket.gethostbyname(by_name.get(name, name)) for name in names]
     # Debian's /etc/hosts gives a host a loopback address of its own, which is no use to the others
     far = next((a for a in addresses if not ipaddress.ip_address(a).is_loopback), None)
@@ -45,39 +44,35 @@ def _lines(*command: str) -> list[str]:
     return done.stdout.splitlines()
 
 
-def node_index(task: int, main: int) -> int:
-    """Task 0 is the main node; the others follow in the order of their index."""
-    if task == 0:
-        return main
-    return task - 1 if task <= main else task
-
-
-def contract_of(told: Mapping[str, Any], meeting: Mapping[str, Any], task: int) -> NodeContract:
-    """The contract of the node that is task ``task``."""
-    general = dict(told["contract"])
-    general["array"] = tuple(general["array"]) if general["array"] else None
-    contract = NodeContract(**general)
-    index = node_index(task, contract.main_index)
-    return dataclasses.replace(
-        contract,
-        node_index=index,
-        master_address=meeting["addresses"][0],
-        master_port=meeting["port"],
-        address=meeting["addresses"][task],
-        ranks_per_node=told["kinds"][told["kind"][index]]["ranks_per_node"],
-        isolation=told["kinds"][told["kind"][index]]["isolation"],
+def contract_of(job: Mapping[str, Any], meeting: Mapping[str, Any], task: int) -> NodeContract:
+    """The contract of the node that is task ``task``: 0 is the main node; the others follow in the order of their index."""
+    general = dict(job["contract"])
+    main = general["main_index"]
+    index = main if task == 0 else task - 1 if task <= main else task
+    kind = job["kinds"][job["kind"][index]]
+    return NodeContract(
+        **{
+            **general,
+            "array": tuple(general["array"]) if general["array"] else None,
+            "node_index": index,
+            "master_address": meeting["addresses"][0],
+            "master_port": meeting["port"],
+            "address": meeting["addresses"][task],
+            "ranks_per_node": kind["ranks_per_node"],
+            "isolation": kind["isolation"],
+        }
     )
 
 
-def environment_of(told: Mapping[str, Any], contract: NodeContract, given: Mapping[str, str]) -> dict[str, str]:
+def environment_of(job: Mapping[str, Any], contract: NodeContract, inherited: Mapping[str, str]) -> dict[str, str]:
     """Slurm's environment, overridden by the job's, overridden by the contract; without the token with which the controller called
     ``sbatch``."""
-    given = {name: value for name, value in given.items() if name != "SLURM_JWT"}
+    inherited = {name: value for name, value in inherited.items() if name != "SLURM_JWT"}
     return {
         "CUDA_VISIBLE_DEVICES": "",  # Slurm sets it where it gave GPUs, and does not hide them where it gave none
-        **given,
-        "PATH": f"{Path(sys.executable).parent}:{given.get('PATH', '/usr/bin:/bin')}",
-        **sealed(told["kinds"][told["kind"][contract.node_index]]["environment"], contract.to_env()),
+        **inherited,
+        "PATH": f"{Path(sys.executable).parent}:{inherited.get('PATH', '/usr/bin:/bin')}",
+        **sealed(job["kinds"][job["kind"][contract.node_index]]["environment"], contract.to_env()),
     }
 
 
@@ -86,12 +81,12 @@ def start(meeting: Mapping[str, Any]) -> NoReturn:
 
     Without a control group of Muster's: Slurm looks for a step's processes in its own.
     """
-    told = json.load(sys.stdin)
-    contract = contract_of(told, meeting, int(os.environ["SLURM_PROCID"]))
-    environment = environment_of(told, contract, os.environ)
-    command = told["kinds"][told["kind"][contract.node_index]]["command"]
-    if told["directory"]:
-        os.chdir(told["directory"])
+    job = json.load(sys.stdin)
+    contract = contract_of(job, meeting, int(os.environ["SLURM_PROCID"]))
+    environment = environment_of(job, contract, os.environ)
+    command = job["kinds"][job["kind"][contract.node_index]]["command"]
+    if job["directory"]:
+        os.chdir(job["directory"])
     devnull = os.open(os.devnull, os.O_RDONLY)
     os.dup2(devnull, 0)
     # where Slurm's process on this host dies, the shim ends the node

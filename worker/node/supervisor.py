@@ -31,12 +31,8 @@ from shared_store.volume.log_files import LogWriter, left_out
 from shared_store.volume.logs import END_LINE, format_line, format_lines
 from shared_store.volume.node_outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
 from worker.node.bus import BusCommand, NodeBus
-from worker.node.memory import MemoryLimit
-from worker.node.network import interface_of
-from worker.node.rank import Rank
-from worker.node.rank_processes import adopt_orphans, kill_group
-from worker.node.stacks import dump_stacks, state_of
-from worker.node.surroundings import Surroundings
+from worker.node.rank import Rank, adopt_orphans, dump_stacks, kill_group, state_of
+from worker.node.surroundings import MemoryLimit, Surroundings, interface_of
 
 _PEER_GRACE = 5.0
 """Seconds that the other ranks of a node get after one of them failed: their collectives are broken, there is nothing to save."""
@@ -94,7 +90,11 @@ class Supervisor:
         started = time.time()
         adopt_orphans()
         self._wakeup, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self._catch_signals(write_end)
+        signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
+        for number in _REQUESTS:
+            signal.signal(number, lambda _number, _frame: self.stop(_ASKED, self.contract.grace))
+        signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
+        self.selector.register(self._wakeup, selectors.EVENT_READ, None)
         self.bus = NodeBus(self.contract, write_end)
         with tempfile.TemporaryDirectory(prefix=SCRATCH.format(pid=os.getpid())) as scratch:
             try:
@@ -163,62 +163,57 @@ class Supervisor:
         for local in range(contract.ranks_per_node):
             rank = Rank(contract, local, scratch / f"error-{local}.json")
             # what the user set in the job's environment stands; some variables are the supervisor's alone
-            given = {name: value for name, value in found.environment.items() if name not in OWN_VARIABLES}
-            env = {**shared, **given, **rank.environment()}
+            own = {name: value for name, value in found.environment.items() if name not in OWN_VARIABLES}
+            env = {**shared, **own, **rank.environment()}
             rank.start(self.command, env, directory=found.directory, prefix=found.prefix, group=self._memory.group)
             self.ranks.append(rank)
             for stream in ("o", "e"):
                 self.selector.register(rank.pipe(stream), selectors.EVENT_READ, (rank, stream))
             self.selector.register(rank.beacon, selectors.EVENT_READ, (rank, "beacon"))
 
-    def _check_memory(self) -> bool:
-        """Whether the node's memory is used up. Then all of its ranks are ended: the kernel has chosen one process, anywhere in the job."""
-        if self._memory.is_used_up():
-            for rank in self.ranks:
-                if rank.running:
-                    kill_group(rank.pid, signal.SIGKILL)
-            return True
-        return False
-
     def _watch(self) -> None:
         """Notice ends; a failure of one rank ends the others, a passed deadline kills."""
-        self._check_memory()
-        for rank in self.ranks:
-            if rank.poll() and rank.exit_code not in (0, EX_TEMPFAIL):
-                self.stop(f"rank {rank.number} failed", _PEER_GRACE)
-            elif rank.running and self.deadline is None and self._stalls(rank):
+        running = [rank for rank in self.ranks if rank.running]
+        if self._memory.is_used_up():  # the kernel has chosen one process, anywhere in the job
+            for rank in running:
+                kill_group(rank.pid, signal.SIGKILL)
+        for rank in running:
+            if rank.poll():
+                if rank.exit_code not in (0, EX_TEMPFAIL):
+                    self.stop(f"rank {rank.number} failed", _PEER_GRACE)
+            elif self.deadline is None and self._stalls(rank):
                 self.stop(f"rank {rank.number} stalls", 0.0)
         if self.deadline is not None and (late := time.monotonic() - self.deadline) >= 0:
-            for rank in self.ranks:
-                if rank.running:
-                    rank.overdue = True
-                    kill_group(rank.pid, signal.SIGKILL)
-                    if late > PATIENCE and (process := find_process(rank.pid)):
-                        rank.give_up(unkillable([process]))
+            for rank in (rank for rank in running if rank.running):
+                rank.overdue = True
+                kill_group(rank.pid, signal.SIGKILL)
+                if late > PATIENCE and (process := find_process(rank.pid)):
+                    rank.give_up(unkillable([process]))
 
     def _stalls(self, rank: Rank) -> bool:
-        """Whether the rank has told of no iteration for too long; then its stacks are in the log."""
-        timeout = self.contract.stall_timeout
-        if timeout is None:
+        """Whether the rank has reported no iteration for too long; then its stacks are in the log."""
+        if (timeout := self.contract.stall_timeout) is None:
             return False
-        # before the first iteration (kernels are compiled) and after the last (evaluation) there is no measure but patience
+        # before the first iteration (kernels are compiled) and after the last (evaluation) only the time limits tell a stall
         since, limit = (rank.heard, timeout) if rank.heard is not None else (rank.spoke, max(timeout, _PATIENCE))
         if (silence := time.monotonic() - since) < limit:
             return False
         if any(key.data == (rank, "beacon") for key, _ in self.selector.select(0)):
             return False  # it was not silent: this process was held up, such as by its log on a volume that hangs
-        timeout = limit
         state = state_of(rank.pid)
-        if state not in _STATES and silence < timeout + _WAITING_EXTRA:
+        if state not in _STATES and silence < limit + _WAITING_EXTRA:
             return False
-        doing = _STATES.get(state, "it waits, perhaps for another rank")
-        rank.stalled = (
-            f"made no progress for {silence:.0f} s after iteration {rank.progress.get('iteration', 0)}: {doing}"
-        )
-        self.write(rank.number, "e", f"stall: rank {rank.number} {rank.stalled}; its stacks:")
-        for line in dump_stacks(rank.pid, speaks=True):
-            self.write(rank.number, "e", line)
+        doing, iteration = _STATES.get(state, "it waits, perhaps for another rank"), rank.progress.get("iteration", 0)
+        rank.stalled = f"made no progress for {silence:.0f} s after iteration {iteration}: {doing}"
+        self._log_stacks(rank, f"stall: rank {rank.number} {rank.stalled}; its stacks:", speaks=True)
         return True
+
+    def _log_stacks(self, rank: Rank, title: str, *, speaks: bool) -> list[str]:
+        """Write a rank's stacks to the log; returns them."""
+        lines = dump_stacks(rank.pid, speaks=speaks) if rank.running else ["ended"]
+        for line in (title, *lines):
+            self.write(rank.number, "e", line)
+        return lines
 
     # -- bus ----------------------------------------------------------------------------------------------------------
 
@@ -232,7 +227,11 @@ class Supervisor:
             if command.name == "checkpoint":
                 self._order_save(command)
             elif command.name == "stacks":
-                command.reply("\n".join(line for rank in self.ranks for line in self._stacks(rank)))
+                found = []
+                for rank in self.ranks:
+                    title, speaks = f"stacks of rank {rank.number}, asked for:", rank.heard is not None
+                    found += [f"rank {rank.number}:", *self._log_stacks(rank, title, speaks=speaks)]
+                command.reply("\n".join(found))
             elif command.name == "stop":
                 command.reply("stopping")
                 self.stop("asked to leave over the bus", self.contract.grace)
@@ -250,19 +249,6 @@ class Supervisor:
             return
         self._saving.append((rank.progress["iteration"], command))
         os.kill(rank.pid, signal.SIGUSR2)
-
-    def _stacks(self, rank: Rank) -> list[str]:
-        lines = dump_stacks(rank.pid, speaks=rank.heard is not None) if rank.running else ["ended"]
-        for line in (f"stacks of rank {rank.number}, asked for:", *lines):
-            self.write(rank.number, "e", line)
-        return [f"rank {rank.number}:", *lines]
-
-    def _catch_signals(self, write_end: int) -> None:
-        signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
-        for number in _REQUESTS:
-            signal.signal(number, lambda _number, _frame: self.stop(_ASKED, self.contract.grace))
-        signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
-        self.selector.register(self._wakeup, selectors.EVENT_READ, None)
 
     # -- output -------------------------------------------------------------------------------------------------------
 
@@ -315,9 +301,9 @@ class Supervisor:
                 continue
             rank, stream = key.data
             if stream == "beacon":
-                if (said := rank.listen()) is None:
+                if (reports := rank.listen()) is None:
                     self.selector.unregister(key.fd)
-                self._answer_saves(said or [])
+                self._answer_saves(reports or [])
                 continue
             lines = rank.read(stream)
             if lines is None:
@@ -331,13 +317,13 @@ class Supervisor:
             time.sleep(time.thread_time() - began)
         return moved
 
-    def _answer_saves(self, said: list[str]) -> None:
-        """Answer those who asked for a save with what became of one that is not older than their wish."""
-        for text in said:
+    def _answer_saves(self, reports: list[str]) -> None:
+        """Answer requests for a save with the result of one that is not older."""
+        for text in reports:
             saved = int(match[0]) if (match := re.search(r"\d+", text)) else 0
-            for wish in [wish for wish in self._saving if saved >= wish[0]]:
-                wish[1].reply(text)
-                self._saving.remove(wish)
+            for _, command in [request for request in self._saving if saved >= request[0]]:
+                command.reply(text)
+            self._saving = [request for request in self._saving if saved < request[0]]
 
     def _drain(self) -> None:
         while self._read(timeout=0):
@@ -351,7 +337,7 @@ class Supervisor:
 
     def _outcome(self, started: float) -> Outcome:
         node, epoch = self.contract.node_index, self.contract.epoch
-        if self._check_memory():
+        if self._memory.is_used_up():
             return Outcome(node, epoch, 128 + signal.SIGKILL, "SIGKILL", OUT_OF_MEMORY, None, started, time.time())
         failed = [rank for rank in self.ranks if rank.exit_code not in (0, EX_TEMPFAIL)]
         ends = [(self._was_asked(rank), rank.ended) for rank in failed]
@@ -370,18 +356,6 @@ class Supervisor:
         """Some engines send SIGTERM to the ranks themselves, too: one may be gone before this process knows."""
         return rank.asked or (self.stopping == _ASKED and rank.signal_name == "SIGTERM")
 
-    def _is_deleted(self) -> bool:
-        """Whether the store is there and the run is not any more: it must not come back in part."""
-        store = self.run.path.parent.parent
-        return not os.path.lexists(self.run.path) and os.path.lexists(store / "store.json")
-
-    def _is_there(self) -> bool:
-        """Whether the volume has the run: an empty directory in its place would take the outcome. Raises OSError."""
-        try:
-            return read_epoch(self.run) > 0
-        except ValueError:
-            return True  # damaged, and there
-
     def _commit(self, outcome: Outcome) -> int:
         """Write the outcome until it stands, or the node is asked to leave; returns its exit code, by which the engine knows it too.
 
@@ -392,10 +366,15 @@ class Supervisor:
         # the time that ranks had to leave is over; whoever asks the node to leave gives it more
         if self.stopping != _ASKED:
             self.stopping = self.deadline = None
-        trouble = ""
-        while not self._is_deleted():
+        trouble, store = "", self.run.path.parent.parent
+        # a run that was deleted, in a store that is mounted, must not come back in part
+        while os.path.lexists(self.run.path) or not os.path.lexists(store / "store.json"):
             try:
-                if not self._is_there():
+                try:  # an empty directory in the run's place would take the outcome
+                    is_mounted = read_epoch(self.run) > 0
+                except ValueError:
+                    is_mounted = True  # damaged, and there
+                if not is_mounted:
                     raise OSError(f"run {self.run.name} is not in the store; see whether its volume is mounted")
                 write_outcome(self.run, self.contract.job, self.contract.attempt, outcome)
                 break

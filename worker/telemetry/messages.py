@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import math
 from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -26,44 +28,32 @@ string[] observation_names
 float32[] observation           # what it sees next; of an episode that has ended, the first of the next one
 """
 SCENE = "foxglove_msgs/msg/SceneUpdate"
-_POSED = "geometry_msgs/Pose pose"
-_LOOK = "foxglove_msgs/Color color"
+_POSE, _COLOR = "geometry_msgs/Pose pose", "foxglove_msgs/Color color"
+_SIZE, _POINTS = "geometry_msgs/Vector3 size", "geometry_msgs/Point[] points"
+_COLORS = "foxglove_msgs/Color[] colors;uint32[] indices"
+_ARROW = ";".join(f"float64 {part}" for part in ("shaft_length", "shaft_diameter", "head_length", "head_diameter"))
+_PRIMITIVES = {
+    "Arrow": ("arrows", f"{_POSE};{_ARROW};{_COLOR}"),
+    "Cube": ("cubes", f"{_POSE};{_SIZE};{_COLOR}"),
+    "Sphere": ("spheres", f"{_POSE};{_SIZE};{_COLOR}"),
+    "Cylinder": ("cylinders", f"{_POSE};{_SIZE};float64 bottom_scale;float64 top_scale;{_COLOR}"),
+    "Line": ("lines", f"uint8 type;{_POSE};float64 thickness;bool scale_invariant;{_POINTS};{_COLOR};{_COLORS}"),
+    "TriangleList": ("triangles", f"{_POSE};{_POINTS};{_COLOR};{_COLORS}"),
+    "Text": ("texts", f"{_POSE};bool billboard;float64 font_size;bool scale_invariant;{_COLOR};string text"),
+    "Model": (
+        "models",
+        f"{_POSE};geometry_msgs/Vector3 scale;{_COLOR};bool override_color;string url;string media_type;uint8[] data",
+    ),
+}
 _SCENE_TYPES = {
-    "Color": ("float64 r", "float64 g", "float64 b", "float64 a"),
-    "KeyValuePair": ("string key", "string value"),
-    "SceneEntityDeletion": ("builtin_interfaces/Time timestamp", "uint8 type", "string id"),
-    "ArrowPrimitive": (
-        _POSED,
-        *(f"float64 {part}" for part in ("shaft_length", "shaft_diameter", "head_length", "head_diameter")),
-        _LOOK,
-    ),
-    "CubePrimitive": (_POSED, "geometry_msgs/Vector3 size", _LOOK),
-    "SpherePrimitive": (_POSED, "geometry_msgs/Vector3 size", _LOOK),
-    "CylinderPrimitive": (_POSED, "geometry_msgs/Vector3 size", "float64 bottom_scale", "float64 top_scale", _LOOK),
-    "LinePrimitive": (
-        *("uint8 type", _POSED, "float64 thickness", "bool scale_invariant", "geometry_msgs/Point[] points"),
-        *(_LOOK, "foxglove_msgs/Color[] colors", "uint32[] indices"),
-    ),
-    "TriangleListPrimitive": (
-        *(_POSED, "geometry_msgs/Point[] points", _LOOK, "foxglove_msgs/Color[] colors", "uint32[] indices"),
-    ),
-    "TextPrimitive": (*(_POSED, "bool billboard", "float64 font_size", "bool scale_invariant", _LOOK, "string text"),),
-    "ModelPrimitive": (
-        *(_POSED, "geometry_msgs/Vector3 scale", _LOOK, "bool override_color"),
-        *("string url", "string media_type", "uint8[] data"),
-    ),
-    "SceneEntity": (
-        *("builtin_interfaces/Time timestamp", "string frame_id", "string id", "builtin_interfaces/Duration lifetime"),
-        *("bool frame_locked", "foxglove_msgs/KeyValuePair[] metadata"),
-        *(
-            f"foxglove_msgs/{kind}Primitive[] {name}"
-            for kind, name in {
-                **{"Arrow": "arrows", "Cube": "cubes", "Sphere": "spheres", "Cylinder": "cylinders"},
-                **{"Line": "lines", "TriangleList": "triangles", "Text": "texts", "Model": "models"},
-            }.items()
-        ),
-    ),
-    "SceneUpdate": ("foxglove_msgs/SceneEntityDeletion[] deletions", "foxglove_msgs/SceneEntity[] entities"),
+    "Color": "float64 r;float64 g;float64 b;float64 a",
+    "KeyValuePair": "string key;string value",
+    "SceneEntityDeletion": "builtin_interfaces/Time timestamp;uint8 type;string id",
+    **{f"{kind}Primitive": fields for kind, (_, fields) in _PRIMITIVES.items()},
+    "SceneEntity": "builtin_interfaces/Time timestamp;string frame_id;string id;builtin_interfaces/Duration lifetime;"
+    "bool frame_locked;foxglove_msgs/KeyValuePair[] metadata;"
+    + ";".join(f"foxglove_msgs/{kind}Primitive[] {name}" for kind, (name, _) in _PRIMITIVES.items()),
+    "SceneUpdate": "foxglove_msgs/SceneEntityDeletion[] deletions;foxglove_msgs/SceneEntity[] entities",
 }
 """Fields of Foxglove's scenes: names and types are those of its ROS 2 package ``foxglove_msgs``, by which viewers know them."""
 
@@ -75,7 +65,7 @@ def types() -> Any:
 
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, fields in _SCENE_TYPES.items():
-        store.register(get_types_from_msg("\n".join(fields), f"foxglove_msgs/msg/{name}"))
+        store.register(get_types_from_msg(fields.replace(";", "\n"), f"foxglove_msgs/msg/{name}"))
     store.register(get_types_from_msg(STEP_DEFINITION, STEP))
     return store
 
@@ -144,16 +134,30 @@ def log(nanoseconds: int, level: int, name: str, text: str) -> bytes:
     return encoded("rcl_interfaces/msg/Log", stamp=stamp(nanoseconds), level=level, **of_log)
 
 
-def picture(nanoseconds: int, frame: str, image: np.ndarray) -> bytes:
-    """A ``sensor_msgs/CompressedImage`` (PNG) of an image, uint8, shape ``(height, width, 3)`` or ``(height, width)``."""
-    import io
-
+def png(image: np.ndarray) -> np.ndarray:
+    """The bytes of an image, uint8, shape ``(height, width, 3)`` or ``(height, width)``, as PNG."""
     from PIL import Image
 
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "PNG", compress_level=1)
-    data = np.frombuffer(buffer.getvalue(), np.uint8)
-    return encoded("sensor_msgs/msg/CompressedImage", header=header(nanoseconds, frame), format="png", data=data)
+    return np.frombuffer(buffer.getvalue(), np.uint8)
+
+
+def tiled(images: Sequence[np.ndarray] | np.ndarray, columns: int, gap: int = 0, ground: int = 255) -> np.ndarray:
+    """Images of one size row by row in one, ``gap`` [px] from each other, on a ground of one brightness; uint8."""
+    height, width, *channels = images[0].shape
+    high, wide, rows = height + gap, width + gap, math.ceil(len(images) / columns)
+    whole = np.full((rows * high - gap, columns * wide - gap, *channels), ground, np.uint8)
+    for number, image in enumerate(images):
+        top, left = number // columns * high, number % columns * wide
+        whole[top : top + height, left : left + width] = image
+    return whole
+
+
+def compressed_image(nanoseconds: int, frame: str, image: np.ndarray) -> bytes:
+    """A ``sensor_msgs/CompressedImage`` of an image as :func:`png` takes it."""
+    kind = "sensor_msgs/msg/CompressedImage"
+    return encoded(kind, header=header(nanoseconds, frame), format="png", data=png(image))
 
 
 def scene(nanoseconds: int, models: Mapping[str, bytes]) -> bytes:
@@ -168,9 +172,7 @@ def scene(nanoseconds: int, models: Mapping[str, bytes]) -> bytes:
     turn = known["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0)
     here = known["geometry_msgs/msg/Pose"](position=point(x=0.0, y=0.0, z=0.0), orientation=turn)
     plain = known["foxglove_msgs/msg/Color"](r=1.0, g=1.0, b=1.0, a=1.0)
-    nothing: dict[str, list[Any]] = {
-        name: [] for name in ("metadata", "arrows", "cubes", "spheres", "cylinders", "lines", "triangles", "texts")
-    }
+    primitives: dict[str, list[Any]] = {name: [] for name, _ in _PRIMITIVES.values()}
     entities = []
     for frame, data in models.items():
         model = known["foxglove_msgs/msg/ModelPrimitive"](
@@ -188,8 +190,8 @@ def scene(nanoseconds: int, models: Mapping[str, bytes]) -> bytes:
             id=frame,
             lifetime=known["builtin_interfaces/msg/Duration"](sec=0, nanosec=0),  # for ever
             frame_locked=True,
-            models=[model],
-            **nothing,
+            metadata=[],
+            **{**primitives, "models": [model]},
         )
         entities.append(entity)
     return encoded(SCENE, deletions=[], entities=entities)

@@ -24,7 +24,6 @@ from collections.abc import Sequence
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
 from urllib.parse import urlencode, urlsplit
 
 from shared_store.process.tether import tied
@@ -86,15 +85,11 @@ class ViewerPage:
         self.server = f"rerun+http://{own}:{stream}/proxy"
         self.url = f"http://{LOOPBACK}:{self._http.server_port}"
         options = {"--bind": own, "--port": stream, "--web-viewer-port": assets, "--server-memory-limit": memory}
-        command = [
-            str(program),
-            "--serve-web",
-            "--newest-first",
-            *(str(part) for pair in options.items() for part in pair),
-        ]
+        arguments = (str(part) for pair in options.items() for part in pair)
+        command = [str(program), "--serve-web", "--newest-first", *arguments, *([str(file)] if file else [])]
         self._log = (self._home / "log").open("w+")
         self._process = subprocess.Popen(
-            tied([*command, str(file)] if file else command, [signal.SIGINT, signal.SIGHUP]),
+            tied(command, [signal.SIGINT, signal.SIGHUP]),
             env=_quiet(self._home),
             stdin=subprocess.DEVNULL,
             stdout=self._log,
@@ -113,9 +108,10 @@ class ViewerPage:
     def check(self) -> None:
         """Raises UserError where Rerun's server is gone."""
         if self._process.poll() is not None:
+            code = self._process.returncode
+            ending = f"signal {-code}" if code < 0 else f"exit code {code}"
             raise UserError(
-                f"the viewer's server ended ({_ending(self._process.returncode)}){self._last_words()}; what it showed is lost: start the "
-                "view again"
+                f"the viewer's server ended ({ending}){self._last_words()}; what it showed is lost: start the view again"
             )
 
     def close(self) -> None:
@@ -129,9 +125,7 @@ class ViewerPage:
     def __enter__(self) -> ViewerPage:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._http.shutdown()
         self.close()
 
@@ -152,16 +146,14 @@ class ViewerPage:
 
 def _listen(port: int | None) -> ThreadingHTTPServer:
     """The page's server. Raises UserError where a port that was asked for can't be had."""
-    ports = PORTS if port is None else (port,)
-    for each in ports:
+    for each in PORTS if port is None else (port,):
         try:
             return ThreadingHTTPServer((LOOPBACK, each), _Handler)
         except OSError as error:
             why = error.strerror or error
     if port is None:
-        raise UserError(
-            f"the page can't be served on any port of {PORTS[0]} to {PORTS[-1]} ({why}); choose one by --port"
-        )
+        ports = f"any port of {PORTS[0]} to {PORTS[-1]}"
+        raise UserError(f"the page can't be served on {ports} ({why}); choose one by --port")
     raise UserError(f"--port {port}: the page can't be served there ({why}); leave --port out for a free one")
 
 
@@ -182,10 +174,6 @@ def _quiet(home: Path) -> dict[str, str]:
     return {**os.environ, "XDG_CONFIG_HOME": str(home), "TELEMETRY_ENABLED": "false", "RUST_LOG": "warn"}
 
 
-def _ending(code: int) -> str:
-    return f"signal {-code}" if code < 0 else f"exit code {code}"
-
-
 class _Handler(BaseHTTPRequestHandler):
     """Serves Rerun's page, and nothing to pages of other origins."""
 
@@ -197,27 +185,23 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._is_ours():
             return
         host = self.headers["Host"]
-        asked = urlsplit(self.path)
+        url = urlsplit(self.path)
         try:
-            if asked.path == "/" and "url=" not in asked.query:
+            if url.path == "/" and "url=" not in url.query:
                 self.send_response(302)
-                query = {
-                    "url": f"rerun+http://{host}/proxy",
-                    "hide_welcome_screen": "1",
-                    "persist": "0",
-                    "theme": "dark",
-                }
+                options = {"hide_welcome_screen": "1", "persist": "0", "theme": "dark"}
+                query = {"url": f"rerun+http://{host}/proxy", **options}
                 self.send_header("Location", f"http://{host}/?{urlencode(query)}")
                 self.send_header("Content-Length", "0")
                 self.end_headers()
-            elif asked.path == "/":
+            elif url.path == "/":
                 with _DIRECT.open(f"{own['assets']}/") as page:
                     content = _ELSEWHERE.sub("", page.read().decode()).replace("Rerun Viewer", "muster view").encode()
                 self._begin("text/html; charset=utf-8", str(len(content)))
                 self.wfile.write(content)
-            elif asked.path in _ASSETS:
-                with _DIRECT.open(f"{own['assets']}{asked.path}") as asset:
-                    self._begin(_ASSETS[asked.path], asset.headers["rerun-final-length"])
+            elif url.path in _ASSETS:
+                with _DIRECT.open(f"{own['assets']}{url.path}") as asset:
+                    self._begin(_ASSETS[url.path], asset.headers["rerun-final-length"])
                     shutil.copyfileobj(asset, self.wfile, 1 << 20)
             else:
                 self.send_error(404)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Sequence
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,9 +20,11 @@ import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
 
+from shared_store.volume.files import write_atomic
 from worker.settings.errors import UserError
 from worker.simulation.on_host import numbers
 from worker.simulation.rendering import look
+from worker.telemetry.messages import tiled
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Tap, TapReader
 
@@ -31,8 +34,10 @@ if TYPE_CHECKING:
 
 FILMS = (".gif", ".mp4")
 MOMENTS = 6
-"""Pictures beside each other in one that stands still."""
-_GLANCE_STEPS, _GLANCE_SECONDS = 4096, 2.0
+"""Frames beside each other in a still image."""
+STRIP = 3, 2
+"""Columns and gap [px] of such an image."""
+_EPISODE_STEPS, _EPISODE_SECONDS = 4096, 2.0
 _FOV = 0.7
 """Vertical [rad]."""
 _VIEW = (-0.55, -0.78, 0.3)
@@ -56,8 +61,7 @@ class StageCamera:
     def __init__(self, stage: Stage, width: int, height: int) -> None:
         self.stage, model = stage, stage.model
         self.columns = math.ceil(math.sqrt(stage.worlds))
-        self.rows = math.ceil(stage.worlds / self.columns)
-        self.size = max(2, width // self.columns), max(2, height // self.rows)
+        self.size = max(2, width // self.columns), max(2, height // math.ceil(stage.worlds / self.columns))
         configuration = SensorCamera.RenderConfig(
             render_order=SensorCamera.RenderOrder.TILED,
             anti_aliasing=SensorCamera.AntiAliasing.MSAA,
@@ -96,33 +100,22 @@ class StageCamera:
         """
         stage, model = self.stage, self.stage.model
         poses = stage.pose(coordinates)
-        self._aim(poses)
-        assert self._targets is not None
+        roots = poses[:, stage.root, :3]
+        if self._targets is None:  # point at each robot, from as far as shows all of it
+            middle, radius = self._extent(poses)
+            self._offset = middle - roots[0]
+            self._targets = roots + self._offset
+            self._distance = 0.95 * radius / math.sin(_FOV / 2)  # the corners of the box are seldom filled
+        else:
+            self._targets[:, :2] = roots[:, :2] + self._offset[:2]
+            self._targets[:, 2] += _SMOOTH * (roots[:, 2] + self._offset[2] - self._targets[:, 2])
         direction = np.array(_VIEW) / np.linalg.norm(_VIEW)
         cameras = [look((target + self._distance * direction).tolist(), target.tolist()) for target in self._targets]
         transforms = wp.array(cameras, dtype=wp.transformf, device=model.device)
         model.bvh_refit_shapes(stage.state)
         self._sensor.update(stage.state, transforms, self._rays, color_image=self._pixels)
         packed = self._pixels.numpy()
-        colors = packed.view(np.uint8).reshape(*packed.shape, 4)[..., :3]
-        tile_width, tile_height = self.size
-        whole = np.full((self.rows * tile_height, self.columns * tile_width, 3), 255, np.uint8)
-        for world, image in enumerate(colors):
-            top, left = world // self.columns * tile_height, world % self.columns * tile_width
-            whole[top : top + tile_height, left : left + tile_width] = image
-        return whole
-
-    def _aim(self, poses: np.ndarray) -> None:
-        """Point at the root of each robot, from as far as shows all of it."""
-        seen = poses[:, self.stage.root, :3]
-        if self._targets is None:
-            middle, radius = self._extent(poses)
-            self._offset = middle - seen[0]
-            self._targets = seen + self._offset
-            self._distance = 0.95 * radius / math.sin(_FOV / 2)  # the corners of the box are seldom filled
-            return
-        self._targets[:, :2] = seen[:, :2] + self._offset[:2]
-        self._targets[:, 2] += _SMOOTH * (seen[:, 2] + self._offset[2] - self._targets[:, 2])
+        return tiled(packed.view(np.uint8).reshape(*packed.shape, 4)[..., :3], self.columns)
 
     def _extent(self, poses: np.ndarray) -> tuple[np.ndarray, float]:
         """Middle and radius of what is seen of the first world [m]."""
@@ -147,7 +140,7 @@ class StageCamera:
         return (least + most) / 2, float(np.linalg.norm(most - least)) / 2
 
 
-class Glance:
+class EpisodePicture:
     """A picture of what a policy does while it is evaluated: moments of the first episode of world 0.
 
     Args:
@@ -156,7 +149,7 @@ class Glance:
 
     def __init__(self, task: Task) -> None:
         self._task = task
-        self._tap = Tap(task, 1, rows=min(task.max_episode_length + 1, _GLANCE_STEPS))
+        self._tap = Tap(task, 1, rows=min(task.max_episode_length + 1, _EPISODE_STEPS))
         self._tap.open()
 
     def picture(self, config: TaskConfig, width: int = 320, height: int = 180) -> bytes:
@@ -164,21 +157,10 @@ class Glance:
         rows = TapReader(self._tap).take()
         self._tap.close()
         length = int(np.argmax(rows.mark("done")[:, 0])) if rows.mark("done").any() else len(rows)
-        span = max(1, min(length, round(_GLANCE_SECONDS * config.control_hz)))
+        span = max(1, min(length, round(_EPISODE_SECONDS * config.control_hz)))
         camera = StageCamera(Stage(type(self._task), config, 1, self._task.device), width, height)
         steps = np.linspace(0, span - 1, MOMENTS).round().astype(int)
-        return encode([strip([camera.take(rows.coordinates[step]) for step in steps])], ".png", 1.0)
-
-
-def strip(pictures: Sequence[np.ndarray], columns: int = 3) -> np.ndarray:
-    """Pictures of one size row by row in one, with a thin line between them."""
-    height, width, _ = pictures[0].shape
-    rows = math.ceil(len(pictures) / columns)
-    whole = np.full((rows * (height + 2) - 2, columns * (width + 2) - 2, 3), 255, np.uint8)
-    for number, picture in enumerate(pictures):
-        top, left = number // columns * (height + 2), number % columns * (width + 2)
-        whole[top : top + height, left : left + width] = picture
-    return whole
+        return encode([tiled([camera.take(rows.coordinates[step]) for step in steps], *STRIP)], ".png", 1.0)
 
 
 def encode(pictures: Sequence[np.ndarray], ending: str, rate: float) -> bytes:
@@ -190,50 +172,33 @@ def encode(pictures: Sequence[np.ndarray], ending: str, rate: float) -> bytes:
         rate: Frames a second.
 
     Raises:
-        UserError: What writes films is not installed.
+        ImportError: PyAV, which writes films, is not installed.
     """
     from PIL import Image
 
     buffer = io.BytesIO()
     if ending == ".mp4":
-        _film(buffer, pictures, rate)
+        import av
+
+        height, width = pictures[0].shape[:2]
+        with av.open(buffer, "w", format="mp4") as container:
+            stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
+            stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
+            stream.options = {"crf": "20", "preset": "veryfast"}
+            for picture in pictures:
+                frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
+                container.mux(stream.encode(frame))
+            container.mux(stream.encode())
         return buffer.getvalue()
     images = [Image.fromarray(picture) for picture in pictures]
     if ending == ".png":
         images[0].save(buffer, "PNG", optimize=True)
         return buffer.getvalue()
     # one palette for all frames, or colours would flicker; taken from some of them
-    palette = Image.fromarray(strip(pictures[:: max(1, len(pictures) // 8)])).quantize(128)
+    palette = Image.fromarray(tiled(pictures[:: max(1, len(pictures) // 8)], *STRIP)).quantize(128)
     small = [image.quantize(128, palette=palette, dither=Image.Dither.NONE) for image in images]
     small[0].save(buffer, "GIF", save_all=True, append_images=small[1:], duration=round(1000 / rate), loop=0)
     return buffer.getvalue()
-
-
-def check_film(ending: str) -> None:
-    """Refuse a film for which a package is missing, before anything is simulated. Raises UserError."""
-    if ending == ".mp4":
-        try:
-            import av  # noqa: F401
-        except ImportError:
-            raise UserError(
-                "an .mp4 needs PyAV, which is not installed where the job ran: pip install 'muster[video]', or make a .gif"
-            ) from None
-
-
-def _film(buffer: io.BytesIO, pictures: Sequence[np.ndarray], rate: float) -> None:
-    from fractions import Fraction
-
-    import av
-
-    height, width = pictures[0].shape[:2]
-    with av.open(buffer, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        stream.options = {"crf": "20", "preset": "veryfast"}
-        for picture in pictures:
-            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(picture), format="rgb24")
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode())
 
 
 def pace(control_hz: float, ending: str) -> tuple[int, float]:
@@ -244,8 +209,6 @@ def pace(control_hz: float, ending: str) -> tuple[int, float]:
 
 def write(path: Path, data: bytes) -> None:
     """Write a picture as a whole or not at all. Raises UserError."""
-    from shared_store.volume.files import write_atomic
-
     try:
         write_atomic(path, data)
     except OSError as error:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from types import TracebackType
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
@@ -17,7 +16,7 @@ _SECONDS = 2.0
 
 
 class Activity:
-    """Tells on standard error what goes on, until :meth:`end`."""
+    """Shows on standard error what goes on, until :meth:`end`."""
 
     def __init__(self) -> None:
         self._bar: Progress | None = None
@@ -26,13 +25,13 @@ class Activity:
             text = TextColumn("{task.description}", markup=False)
             self._bar = Progress(text, BarColumn(bar_width=24), console=console, transient=True)
             self._task = self._bar.add_task("", total=None)
-        self._said, self._told = "", 0.0
+        self._printed, self._printed_at = "", 0.0
 
     def say(self, text: str) -> None:
         """A new activity of unknown duration."""
         if self._bar is None:
             print(text, file=sys.stderr, flush=True)
-            self._said, self._told = text, time.monotonic()
+            self._printed, self._printed_at = text, time.monotonic()
             return
         self._bar.start()
         self._bar.update(self._task, description=text, total=None)
@@ -43,7 +42,7 @@ class Activity:
         if self._bar is not None:
             self._bar.start()
             self._bar.update(self._task, description=text, completed=done, total=total)
-        elif text != self._said and time.monotonic() - self._told >= _SECONDS:
+        elif text != self._printed and time.monotonic() - self._printed_at >= _SECONDS:
             self.say(text)
 
     def end(self) -> None:
@@ -54,9 +53,7 @@ class Activity:
     def __enter__(self) -> Activity:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.end()
 
 

@@ -12,49 +12,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from worker.settings.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.intact_records import SoundRecords
 from worker.telemetry.recording import PARTIAL
-from worker.telemetry.screen import Appearance
+from worker.telemetry.screen import Appearance, Steps
 
 BATCH = 256
 """Control steps that are handed out together."""
 _IMAGES = re.compile(r"/world_(\d+)/(.+)/image/compressed")
 """World and camera."""
-
-
-@dataclass
-class RecordedSteps:
-    """Consecutive control steps of a recording.
-
-    Attributes:
-        times: [ns since 1970].
-        steps: Numbers, from 1.
-        poses: Shape ``(steps, worlds, links, 7)``: position [m] and quaternion xyzw in the frame of the world.
-        rewards: Weighted terms, mean of the worlds; shape ``(steps, terms)``.
-        said: Lines of the log: time [ns], who, text.
-        returns: Of episodes that ended: time [ns], return.
-        images: By camera and step, PNG of each world; steps of which none is there, or not of every world, have none.
-    """
-
-    times: np.ndarray
-    steps: np.ndarray
-    poses: np.ndarray
-    rewards: np.ndarray
-    said: list[tuple[int, str, str]]
-    returns: list[tuple[int, float]]
-    images: dict[str, dict[int, list[bytes]]] = field(default_factory=dict)
-
-    def pictures(self, camera: str) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
-        """Times, numbers and images of the steps of which a camera has images, as :meth:`worker.telemetry.screen.Screen.pictures` takes them."""
-        from PIL import Image
-
-        found = self.images.get(camera, {})
-        seen = [np.stack([np.asarray(Image.open(io.BytesIO(each))) for each in worlds]) for worlds in found.values()]
-        places = list(found)
-        return self.times[places], self.steps[places], seen
 
 
 class Replay:
@@ -83,7 +52,7 @@ class Replay:
         cameras: list[str] = []
         terms: tuple[str, ...] | None = None
         steps = False
-        with self._ours():
+        with self._own_messages():
             for kind, topic, _, data in self._messages():
                 if topic == "/tf" and terms is not None:
                     break  # the first step is over
@@ -115,42 +84,31 @@ class Replay:
         what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
         raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
 
-    def parts(self) -> Iterator[RecordedSteps]:
+    def parts(self) -> Iterator[Steps]:
         """All control steps, in order."""
         found = _Gathered(self.look)
-        with self._ours():
+        with self._own_messages():
             for kind, topic, time, data in self._messages():
                 if topic == "/tf":
                     if len(found.times) == BATCH:
-                        yield self._part(found)
+                        yield found.part(self.count + 1)
+                        self.count += BATCH
                         found = _Gathered(self.look, found.sums)
                     found.move(time, _decoded(kind, data).transforms)
                 elif topic == "/rosout":
                     line = _decoded(kind, data)
-                    found.said.append((time, line.name, line.msg))
+                    found.log.append((time, line.name, line.msg))
                 elif topic.endswith("/rl/step") and found.times:
                     found.step(time, _decoded(kind, data))
-                elif (seen := _IMAGES.fullmatch(topic)) and found.times:
-                    found.images[seen[2]][len(found.times) - 1].append(bytes(_decoded(kind, data).data))
+                elif (camera := _IMAGES.fullmatch(topic)) and found.times:
+                    found.images[camera[2]][len(found.times) - 1].append(bytes(_decoded(kind, data).data))
         if found.times:
-            yield self._part(found)
-
-    def _part(self, found: _Gathered) -> RecordedSteps:
-        first, self.count = self.count + 1, self.count + len(found.times)
-        steps = np.arange(first, self.count + 1)
-        rewards = np.array([np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in found.rewards])
-        worlds = len(self.look.places)
-        images = {
-            camera: {step: seen for step, seen in steps.items() if len(seen) == worlds}
-            for camera, steps in found.images.items()
-        }
-        return RecordedSteps(
-            np.array(found.times), steps, np.array(found.poses), rewards, found.said, found.returns, images
-        )
+            yield found.part(self.count + 1)
+            self.count += len(found.times)
 
     @contextmanager
-    def _ours(self) -> Iterator[None]:
-        """Refuse what is not as Muster writes it. Raises UserError."""
+    def _own_messages(self) -> Iterator[None]:
+        """A context that reads Muster's messages. Raises UserError for messages of another form."""
         try:
             yield
         except UserError:
@@ -195,11 +153,26 @@ class _Gathered:
     times: list[int] = field(default_factory=list)
     poses: list[np.ndarray] = field(default_factory=list)
     rewards: list[list[np.ndarray]] = field(default_factory=list)
-    said: list[tuple[int, str, str]] = field(default_factory=list)
+    log: list[tuple[int, str, str]] = field(default_factory=list)
     returns: list[tuple[int, float]] = field(default_factory=list)
     images: defaultdict[str, defaultdict[int, list[bytes]]] = field(
         default_factory=lambda: defaultdict(lambda: defaultdict(list))
     )
+
+    def part(self, first: int) -> Steps:
+        """The steps, numbered from ``first``; those without an image of every world have none."""
+        rewards = [np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in self.rewards]
+        worlds, count = len(self.look.places), len(self.times)
+        images = {
+            camera: {
+                step: np.stack([np.asarray(Image.open(io.BytesIO(each))) for each in files])
+                for step, files in steps.items()
+                if len(files) == worlds
+            }
+            for camera, steps in self.images.items()
+        }
+        arrays = np.array(self.times), np.arange(first, first + count), np.array(self.poses), np.array(rewards)
+        return Steps(*arrays, images=images, log=self.log, returns=self.returns)
 
     def move(self, time: int, transforms: list[Any]) -> None:
         parts = [(each.transform.translation, each.transform.rotation) for each in transforms]

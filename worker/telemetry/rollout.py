@@ -111,11 +111,9 @@ class Rollout:
 
     def facts(self) -> dict[str, str]:
         """For the metadata of a recording."""
-        return {**facts_of(self.run, self.checkpoint.manifest), **self._own()}
-
-    def _own(self) -> dict[str, str]:
         learner = self.checkpoint.manifest.get("files", {}).get("learner.pt", {})
         return {
+            **facts_of(self.run, self.checkpoint.manifest),
             "checkpoint": self.checkpoint.name,
             "iteration": str(self.checkpoint.iteration),
             "seed": str(self.seed),

@@ -6,11 +6,10 @@ On the timeline ``time`` are wall-clock times; of a recording its own ones. ``it
 from __future__ import annotations
 
 import contextlib
-import io
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +19,8 @@ os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is s
 
 import rerun as rr
 import rerun.blueprint as rrb
-from PIL import Image
+
+from worker.telemetry.messages import png, tiled
 
 _ROOT, _MIDDLE = "world", "middle"
 """Frames: of all worlds, and of what the eye follows."""
@@ -56,6 +56,31 @@ class Appearance:
     cameras: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True)
+class Steps:
+    """Consecutive control steps of the worlds.
+
+    Attributes:
+        times: [ns since 1970], shape ``(steps,)``.
+        steps: Their numbers.
+        poses: Position [m] and quaternion xyzw of the links in their worlds, shape ``(steps, worlds, links, 7)``.
+        rewards: Weighted reward terms, mean of the worlds; shape ``(steps, terms)``.
+        iteration: Of the training, where there is one.
+        images: By camera and index of the step: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
+        log: Lines: time [ns], source, text.
+        returns: Of episodes that ended: time [ns], return.
+    """
+
+    times: np.ndarray
+    steps: np.ndarray
+    poses: np.ndarray
+    rewards: np.ndarray
+    iteration: int | None = None
+    images: Mapping[str, Mapping[int, np.ndarray]] = field(default_factory=dict)
+    log: Sequence[tuple[int, str, str]] = ()
+    returns: Sequence[tuple[int, float]] = ()
+
+
 class Screen:
     """A stream to Rerun's server.
 
@@ -63,86 +88,57 @@ class Screen:
         server: Its URL, or the path of an .rrd file.
         title: What is shown, in a few words.
         look: Of the worlds.
-        start: Joint frames with which the eye is placed, shape ``(worlds, links, 7)``.
         live: Whether the newest state is followed; otherwise it is played from its beginning.
     """
 
-    def __init__(self, server: str | Path, title: str, look: Appearance, start: np.ndarray, live: bool) -> None:
-        self._look = look
-        self._terms: list[tuple[np.ndarray, np.ndarray, np.ndarray, int | None]] = []
-        """The rows that :meth:`frames` has not sent yet: times, steps, reward terms, iteration."""
+    def __init__(self, server: str | Path, title: str, look: Appearance, live: bool) -> None:
+        self._look, self._live, self._is_aimed = look, live, False
+        self._pending: list[Steps] = []
+        """Those whose reward terms are not sent yet."""
         self._rr = rr.RecordingStream("muster")
         self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
         self._rr.send_recording_name(title)
-        self._stand()
-        center, position = _eye(self._placed(start[None])[0])
-        self._rr.send_blueprint(_blueprint(center, position, look.cameras, live), make_default=True)
+        self._log_fixed()
 
-    def frames(
-        self, times: np.ndarray, steps: np.ndarray, poses: np.ndarray, rewards: np.ndarray, iteration: int | None = None
-    ) -> None:
-        """Show control steps.
-
-        Args:
-            times: Of each [ns since 1970], shape ``(steps,)``.
-            steps: Their numbers.
-            poses: Position [m] and quaternion xyzw of the links in their worlds, shape ``(steps, worlds, links, 7)``.
-            rewards: Weighted reward terms, mean of the worlds; shape ``(steps, terms)``.
-            iteration: Of the training, where there is one.
-        """
-        if not len(times):
-            return
-        placed = self._placed(poses)
-        frames = [_frame(world, link) for world in range(poses.shape[1]) for link in self._look.links]
-        middle = np.zeros((len(times), 1, 7))
+    def show(self, shown: Steps) -> None:
+        """Show control steps; with the first of all, the eye is placed."""
+        count, placed = len(shown.times), self._placed(shown.poses)
+        if not self._is_aimed:
+            self._is_aimed = True
+            self._rr.send_blueprint(_blueprint(placed[0], self._look.cameras, self._live), make_default=True)
+        frames = [_frame(world, link) for world in range(placed.shape[1]) for link in self._look.links]
+        middle = np.zeros((count, 1, 7))
         middle[:, 0, :3], middle[:, 0, 6] = placed[..., :3].mean((1, 2)), 1.0
         frames.append(_MIDDLE)
-        rows = np.concatenate([placed.reshape(len(times), -1, 7), middle], 1).reshape(-1, 7)
+        rows = np.concatenate([placed.reshape(count, -1, 7), middle], 1).reshape(-1, 7)
         columns = rr.Transform3D.columns(
             translation=rows[:, :3],
             quaternion=rows[:, 3:],
-            child_frame=frames * len(times),
+            child_frame=frames * count,
             parent_frame=[_ROOT] * len(rows),
         )
-        self._rr.send_columns("tf", _index(times, steps, iteration, len(frames)), columns)
-        self._terms.append((times, steps, rewards, iteration))
-        if sum(len(each[0]) for each in self._terms) >= _TERMS:
+        self._rr.send_columns("tf", _index(shown.times, shown.steps, shown.iteration, len(frames)), columns)
+        self._pending.append(shown)
+        if sum(len(each.times) for each in self._pending) >= _TERMS:
             self._send_terms()
-
-    def pictures(
-        self,
-        camera: str,
-        times: np.ndarray,
-        steps: np.ndarray,
-        seen: Sequence[np.ndarray],
-        iteration: int | None = None,
-    ) -> None:
-        """Show what a camera saw in all worlds, as one picture of tiles.
-
-        Args:
-            camera: One of the look's.
-            times: [ns since 1970], shape ``(steps,)``.
-            steps: Their numbers.
-            seen: Of each step: uint8, shape ``(worlds, height, width, 3)`` or ``(worlds, height, width)``.
-            iteration: Of the training, where there is one.
-        """
-        if not len(times):
-            return
-        columns = rr.EncodedImage.columns(
-            blob=[_png(tiled(each)) for each in seen], media_type=["image/png"] * len(seen)
-        )
-        self._rr.send_columns(f"images/{camera}", _index(times, steps, iteration), columns)
+        for camera, images in shown.images.items():
+            if places := list(images):
+                # what a camera saw in all worlds, as one image of tiles
+                blobs = [png(tiled(each, math.ceil(math.sqrt(len(each))), ground=0)) for each in images.values()]
+                tiles = rr.EncodedImage.columns(blob=blobs, media_type=["image/png"] * len(blobs))
+                index = _index(shown.times[places], shown.steps[places], shown.iteration)
+                self._rr.send_columns(f"images/{camera}", index, tiles)
+        self.log(shown.log)
+        self.curve("episodes", [value for _, value in shown.returns], np.array([at for at, _ in shown.returns]), [])
 
     def _send_terms(self) -> None:
         """Several steps at once: each chunk that is sent costs the browser about the same, whatever is in it."""
-        pending, self._terms = self._terms, []
-        if not self._look.terms or not pending:
-            return
-        times, steps, rewards = (np.concatenate([each[part] for each in pending]) for part in range(3))
-        columns = rr.Scalars.columns(scalars=rewards.astype(np.float64).reshape(-1))
-        self._rr.send_columns(
-            "terms", _index(times, steps, pending[-1][3]), columns.partition([len(self._look.terms)] * len(times))
-        )
+        pending, self._pending = self._pending, []
+        if self._look.terms and pending:
+            times, steps = (np.concatenate([getattr(each, name) for each in pending]) for name in ("times", "steps"))
+            rewards = np.concatenate([each.rewards for each in pending]).astype(np.float64)
+            columns = rr.Scalars.columns(scalars=rewards.reshape(-1)).partition([len(self._look.terms)] * len(times))
+            self._rr.send_columns("terms", _index(times, steps, pending[-1].iteration), columns)
 
     def curve(self, name: str, values: Sequence[float], times: np.ndarray | None, iterations: Sequence[int]) -> None:
         """Add points to a curve of returns, at times [ns], where they belong on that timeline, and at iterations, if any."""
@@ -152,12 +148,14 @@ class Screen:
         if len(values) and index:
             self._rr.send_columns(f"return/{name}", index, rr.Scalars.columns(scalars=np.asarray(values, np.float64)))
 
-    def say(self, lines: Iterable[tuple[int, str, str]]) -> None:
-        """Add lines of the log: time [ns since 1970], who says it, text."""
+    def log(self, lines: Iterable[tuple[int, str, str]]) -> None:
+        """Add lines of the log: time [ns since 1970], source, text."""
         found = list(lines)
         if found:
             times = np.array([time for time, _, _ in found]).astype("datetime64[ns]")
-            texts = [f"{str(time)[11:19]}  {who}  {text}" for time, (_, who, text) in zip(times, found, strict=True)]
+            texts = [
+                f"{str(time)[11:19]}  {source}  {text}" for time, (_, source, text) in zip(times, found, strict=True)
+            ]
             self._rr.send_columns("log", [rr.TimeColumn("time", timestamp=times)], rr.TextLog.columns(text=texts))
 
     def close(self) -> None:
@@ -167,8 +165,8 @@ class Screen:
             self._rr.flush(timeout_sec=5.0)
             self._rr.disconnect()
 
-    def _stand(self) -> None:
-        """The parts that do not move."""
+    def _log_fixed(self) -> None:
+        """Log the parts that do not move."""
         self._rr.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._rr.log(
             "worlds/middle", rr.Points3D([[0.0, 0.0, 0.0]], radii=0.001), rr.CoordinateFrame(_MIDDLE), static=True
@@ -177,21 +175,21 @@ class Screen:
         self._rr.log("terms", rr.SeriesLines(names=list(self._look.terms), colors=colors), static=True)
         for name, data in self._look.shapes.items():
             shape = rr.Asset3D(contents=data, media_type="model/gltf-binary")
-            if name == "ground":
-                self._rr.log("ground", shape, rr.CoordinateFrame("ground"), static=True)
-                self._fix("ground", np.zeros(3))
-                continue
-            for world, place in enumerate(self._look.places):
-                entity = f"worlds/world_{world}/{name.replace('/', '_') or 'fixed'}"
-                self._rr.log(entity, shape, rr.CoordinateFrame(_frame(world, name)), static=True)
-                if not name:
-                    self._fix(_frame(world, name), place)
-
-    def _fix(self, frame: str, place: np.ndarray) -> None:
-        """A frame of shapes that do not move."""
-        upright = rr.Quaternion(xyzw=_UPRIGHT)
-        where = rr.Transform3D(translation=place, quaternion=upright, child_frame=frame, parent_frame=_ROOT)
-        self._rr.log(f"fixed/{frame}", where, static=True)
+            entity, is_ground = name.replace("/", "_") or "fixed", name == "ground"
+            worlds = (
+                [("ground", "ground", np.zeros(3))]
+                if is_ground
+                else [
+                    (f"worlds/world_{world}/{entity}", _frame(world, name), place)
+                    for world, place in enumerate(self._look.places)
+                ]
+            )
+            for path, frame, place in worlds:
+                self._rr.log(path, shape, rr.CoordinateFrame(frame), static=True)
+                if is_ground or not name:
+                    upright = rr.Quaternion(xyzw=_UPRIGHT)
+                    where = rr.Transform3D(translation=place, quaternion=upright, child_frame=frame, parent_frame=_ROOT)
+                    self._rr.log(f"fixed/{frame}", where, static=True)
 
     def _placed(self, poses: np.ndarray) -> np.ndarray:
         """Poses of the shapes, which are y-up, with the worlds beside each other."""
@@ -199,23 +197,6 @@ class Screen:
         half = np.sqrt(0.5)  # times _UPRIGHT, from the right
         turned = np.stack([half * (x + w), half * (y + z), half * (z - y), half * (w - x)], -1)
         return np.concatenate([poses[..., :3] + self._look.places[:, None], turned], -1)
-
-
-def tiled(images: np.ndarray) -> np.ndarray:
-    """Images of worlds side by side in rows that are about as many as columns, world 0 at the upper left; shape ``(height, width[, 3])``."""
-    worlds, height, width = images.shape[:3]
-    columns = math.ceil(math.sqrt(worlds))
-    rows = math.ceil(worlds / columns)
-    grid = np.zeros((rows * columns, *images.shape[1:]), np.uint8)
-    grid[:worlds] = images
-    grid = grid.reshape(rows, columns, height, width, -1).swapaxes(1, 2).reshape(rows * height, columns * width, -1)
-    return grid if images.ndim == 4 else grid[..., 0]
-
-
-def _png(image: np.ndarray) -> np.ndarray:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", compress_level=1)
-    return np.frombuffer(buffer.getvalue(), np.uint8)
 
 
 def _index(times: np.ndarray, steps: np.ndarray, iteration: int | None, rows: int = 1) -> list[rr.TimeColumn]:
@@ -231,20 +212,13 @@ def _frame(world: int, link: str) -> str:
     return f"world_{world}/{link}" if link else f"world_{world}"
 
 
-def _eye(placed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Target and position of a camera that sees all worlds; ``placed``: shape ``(worlds, links, 7)``."""
+def _blueprint(placed: np.ndarray, cameras: Sequence[str], live: bool) -> rrb.Blueprint:
+    """The views, and an eye that sees all worlds; ``placed``: shape ``(worlds, links, 7)``."""
     low, high = placed[..., :3].min((0, 1)), placed[..., :3].max((0, 1))
     center = (low + high) / 2
     span = max(1.0, float(np.linalg.norm(high - low)))
-    return center, center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5])
-
-
-def _blueprint(center: np.ndarray, position: np.ndarray, cameras: Sequence[str], live: bool) -> rrb.Blueprint:
-    recent: Any = rrb.VisibleTimeRange(
-        "time",
-        start=rrb.TimeRangeBoundary.cursor_relative(seconds=-_RECENT),
-        end=rrb.TimeRangeBoundary.cursor_relative(seconds=0),
-    )
+    cursor = rrb.TimeRangeBoundary.cursor_relative
+    recent: Any = rrb.VisibleTimeRange("time", start=cursor(seconds=-_RECENT), end=cursor(seconds=0))
     worlds = rrb.Spatial3DView(
         name="Worlds",
         contents=["/worlds/**", "/ground/**"],
@@ -252,7 +226,7 @@ def _blueprint(center: np.ndarray, position: np.ndarray, cameras: Sequence[str],
         spatial_information=rrb.SpatialInformation(_ROOT, show_axes=False),
         eye_controls=rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
-            position=position,
+            position=center + (0.6 * span + 1.2) * np.array([1.0, -0.55, 0.5]),
             look_target=center,
             eye_up=(0, 0, 1),
             tracking_entity="/worlds/middle",

@@ -1,6 +1,6 @@
 """Tracking services: W&B and MLflow, each as what :mod:`worker.track` needs of it. Imports neither before it is asked for.
 
-A service is asked how far it has a run's history, and is given what comes after: nothing is sent twice, whatever died in between.
+A service reports how far it has a run's history, and gets what comes after: nothing is sent twice, whatever died in between.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from shared_store.volume.evaluations import flattened
 from shared_store.volume.files import remove_tree
@@ -54,46 +54,54 @@ class TrainingEnd:
     files: Sequence[Path]
 
 
-class Service(Protocol):
-    """One of the services. What it can't do now it raises; the caller tries again."""
+class Service:
+    """One of the services. Each method may raise any error of the service; the caller tries again.
 
-    identity: str
-    """By which the service knows the open run."""
+    Args:
+        tracked: The run.
+        settings: Of the service, in the job.
+
+    Attributes:
+        identity: By which the service knows the open run.
+    """
+
+    def __init__(self, tracked: Tracked, settings: Mapping[str, Any]) -> None:
+        self._tracked, self._settings = tracked, settings
+        self.identity = ""
 
     def prepare(self) -> None:
-        """Find package and credentials, without the network. Raises Refused."""
+        """Find package and credentials, without the network. Raises ServiceRefused."""
 
     def open(self, identity: str | None, fresh: str) -> int:
         """Begin to send to the run ``identity``, or to a new one called ``fresh``; returns the last iteration that it has, 0 for none."""
+        raise NotImplementedError
 
     @property
     def place(self) -> str:
         """Address of the open run for a browser."""
+        raise NotImplementedError
 
     def send(self, records: Sequence[Mapping[str, Any]]) -> None:
         """Send whole iterations, in order."""
 
     def finish(self, ending: TrainingEnd) -> None:
-        """Upload what there is at the end, and close the run."""
+        """Upload what exists at the end, and close the run."""
 
     def leave(self) -> None:
         """Close the run as it is."""
 
 
-class WandB:
-    """Weights & Biases, through its own client: it sends on threads, and tries again while its server is away."""
+class WandB(Service):
+    """Weights & Biases, through its own client: it sends on threads, and tries again while its server can't be reached."""
 
-    def __init__(self, tracked: Tracked, settings: Mapping[str, Any]) -> None:
-        self._tracked, self._given = tracked, settings
-        self._offline = False
-        self._run: Any = None
-        self.identity = ""
+    _offline = False
+    _run: Any = None
 
     def prepare(self) -> None:
         self._wandb = _package("wandb")
         # before its first use: it writes nothing to the terminal, and asks for no key
         known = self._wandb.setup(settings=self._wandb.Settings(silent=True, console="off")).settings
-        mode = self._given.get("mode") or known.mode
+        mode = self._settings.get("mode") or known.mode
         if mode == "disabled":
             raise ServiceRefused("WANDB_MODE is disabled; remove wandb from track, or choose online or offline")
         self._offline = mode in ("offline", "dryrun")
@@ -116,9 +124,9 @@ class WandB:
         if self._offline:  # a file that a kill has cut lacks what was in memory: the new one has the whole history
             for old in (directory / "wandb").glob(f"offline-run-*-{self.identity}"):
                 remove_tree(old)
-        given = {key: self._given.get(key) for key in ("entity", "group", "tags")}
-        given = {key: value for key, value in given.items() if value}
-        project = self._given.get("project") or os.environ.get("WANDB_PROJECT") or self._tracked.task
+        labels = {key: self._settings[key] for key in ("entity", "group", "tags") if self._settings.get(key)}
+        project = self._settings.get("project") or os.environ.get("WANDB_PROJECT") or self._tracked.task
+        settings = {"silent": True, "console": "off", "save_code": False, "disable_job_creation": True}
         self._run = self._wandb.init(
             id=self.identity,
             name=self.identity,
@@ -127,10 +135,8 @@ class WandB:
             mode="offline" if self._offline else "online",
             resume=None if self._offline else "allow",
             config=dict(self._tracked.config),
-            settings=self._wandb.Settings(
-                silent=True, console="off", save_code=False, disable_job_creation=True, init_timeout=30
-            ),
-            **given,
+            settings=self._wandb.Settings(**settings, init_timeout=30),
+            **labels,
         )
         return max(0, self._run.step - 1) if self._run.resumed else 0
 
@@ -161,18 +167,14 @@ class WandB:
         self._run.finish()
 
 
-class MLflow:
+class MLflow(Service):
     """MLflow: a tracking server, or a database file."""
-
-    def __init__(self, tracked: Tracked, settings: Mapping[str, Any]) -> None:
-        self._tracked, self._given = tracked, settings
-        self.identity = ""
 
     def prepare(self) -> None:
         # its own patience is ten minutes a request; what it gives up is tried again here
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_MAX_RETRIES", "1")
         os.environ.setdefault("MLFLOW_HTTP_REQUEST_TIMEOUT", "20")
-        uri = self._given.get("uri") or os.environ.get("MLFLOW_TRACKING_URI")
+        uri = self._settings.get("uri") or os.environ.get("MLFLOW_TRACKING_URI")
         if not uri:
             raise ServiceRefused("there is no server: set track.mlflow.uri, or MLFLOW_TRACKING_URI where the job runs")
         self._entities = _package("mlflow.entities")
@@ -182,31 +184,25 @@ class MLflow:
             raise ServiceRefused(one_line(error)) from None
 
     def open(self, identity: str | None, fresh: str) -> int:
-        name = self._given.get("experiment") or os.environ.get("MLFLOW_EXPERIMENT_NAME") or self._tracked.task
+        name = self._settings.get("experiment") or os.environ.get("MLFLOW_EXPERIMENT_NAME") or self._tracked.task
         found = self._client.get_experiment_by_name(name)
         self._experiment = found.experiment_id if found else self._client.create_experiment(name)
         if identity is None:  # one that was created before a kill, and was not noted
             same = self._client.search_runs([self._experiment], f"tags.`muster.run` = '{fresh}'", max_results=1)
-            identity = same[0].info.run_id if same else self._create(fresh)
+            tags = {**self._settings.get("tags", {}), "muster.run": fresh}
+            made = same[0] if same else self._client.create_run(self._experiment, run_name=fresh, tags=tags)
+            identity = str(made.info.run_id)
         self.identity = identity
         self._client.update_run(identity, status="RUNNING")
         self._describe()
         steps = self._client.get_metric_history(identity, "train/env_steps")
         return max((each.step for each in steps), default=0)
 
-    def _create(self, name: str) -> str:
-        tags = {**self._given.get("tags", {}), "muster.run": name}
-        return str(self._client.create_run(self._experiment, run_name=name, tags=tags).info.run_id)
-
     def _describe(self) -> None:
         """Send the parameters that the run lacks: all of a new one, the rest where a kill came between."""
         has = self._client.get_run(self.identity).data.params
-        lacking = [
-            self._entities.Param(key, str(value)[:_LONGEST])
-            for key, value in flattened(self._tracked.config)
-            if key not in has
-        ]
-        for part in _parts(lacking, _PARAMETERS):
+        lacking = [(key, value) for key, value in flattened(self._tracked.config) if key not in has]
+        for part in _parts([self._entities.Param(key, str(value)[:_LONGEST]) for key, value in lacking], _PARAMETERS):
             self._client.log_batch(self.identity, params=part)
 
     @property
@@ -239,7 +235,7 @@ class MLflow:
         self._client.set_terminated(self.identity, OUTCOMES["stopped"])
 
 
-SERVICES: dict[str, type[WandB] | type[MLflow]] = {"wandb": WandB, "mlflow": MLflow}
+SERVICES: dict[str, type[Service]] = {"wandb": WandB, "mlflow": MLflow}
 
 
 def one_line(error: BaseException) -> str:

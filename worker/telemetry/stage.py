@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import warnings
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +17,15 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from shared_store.volume.layout import Run
+from worker.learning.job import configure, user_errors, with_texts
+from worker.settings.errors import UserError
 from worker.simulation import robot_files
 from worker.simulation.carriers import is_carrier
 from worker.simulation.on_host import numbers
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
+from worker.tasks import find_task
 from worker.tasks.run.task import Task
 
 if TYPE_CHECKING:
@@ -58,7 +63,7 @@ class Stage:
     """
 
     def __init__(self, task_type: type[Task], config: TaskConfig, worlds: int, device: str = "cpu") -> None:
-        sketch = _seen(task_type).sketch(config)
+        sketch = _with_visuals(task_type).sketch(config)
         template = sketch.template
         self.worlds = worlds
         views: list[RobotView] = list(sketch.views.values())
@@ -146,14 +151,17 @@ class Stage:
         return {name: scene.export(file_type="glb") for name, scene in scenes.items()}
 
 
-def _seen(task_type: type[Task]) -> type[Task]:
-    """The task, with the geoms of its robots that are only seen."""
+def _with_visuals(task_type: type[Task]) -> type[Task]:
+    """The task, with the geoms of its robots and objects that are only seen."""
+
+    def shown(entity: Any) -> Any:
+        return dataclasses.replace(entity, visuals=True) if hasattr(entity, "visuals") else entity
 
     def robot(self: Any, config: Any) -> Any:
-        return _with_visuals(task_type.robot(self, config))
+        return shown(task_type.robot(self, config))
 
     def objects(self: Any, config: Any) -> Any:
-        return {name: _with_visuals(each) for name, each in task_type.objects(self, config).items()}
+        return {name: shown(each) for name, each in task_type.objects(self, config).items()}
 
     return type(task_type.__name__, (task_type,), {"robot": robot, "objects": objects})
 
@@ -170,10 +178,6 @@ def _robot_file(sketch: Task, config: TaskConfig) -> tuple[str, str] | None:
     return ("robot.urdf" if found.format == "urdf" else "robot.xml"), text
 
 
-def _with_visuals(entity: Any) -> Any:
-    return dataclasses.replace(entity, visuals=True) if hasattr(entity, "visuals") else entity
-
-
 def _link_names(labels: list[str]) -> list[str]:
     """Short names of bodies; those of other robots and objects behind that of their owner, and the whole label of any that are alike."""
     found = []
@@ -186,29 +190,40 @@ def _link_names(labels: list[str]) -> list[str]:
 
 def _mesh(kind: int, size: np.ndarray, source: Any) -> tuple[np.ndarray, np.ndarray] | None:
     """Vertices [m] and triangles of a shape in its own frame; None of what has no surface."""
+    kinds, mesh = newton.GeoType, newton.Mesh
+    if kind in (kinds.MESH, kinds.CONVEX_MESH):
+        return np.asarray(source.vertices) * size, np.asarray(source.indices).reshape(-1, 3)
     first, second, third = (float(value) for value in size)
-    kinds, plain = newton.GeoType, newton.Mesh
-    options: dict[str, Any] = {"compute_inertia": False}
-    if kind == kinds.PLANE:
-        made = plain.create_plane(first or 40.0, second or 40.0, **options)
-    elif kind == kinds.SPHERE:
-        made = plain.create_sphere(first, **options)
-    elif kind == kinds.ELLIPSOID:
-        made = plain.create_ellipsoid(first, second, third, **options)
-    elif kind == kinds.CAPSULE:
-        made = plain.create_capsule(first, second, up_axis=newton.Axis.Z, **options)
-    elif kind == kinds.CYLINDER:
-        made = plain.create_cylinder(first, second, up_axis=newton.Axis.Z, **options)
-    elif kind == kinds.CONE:
-        made = plain.create_cone(first, second, up_axis=newton.Axis.Z, **options)
-    elif kind == kinds.BOX:
-        made = plain.create_box(first, second, third, **options)
-    elif kind == kinds.HFIELD:
+    upright = {"up_axis": newton.Axis.Z}
+    makers: dict[int, tuple[Callable[..., Any], tuple[float, ...], dict[str, Any]]] = {
+        kinds.PLANE: (mesh.create_plane, (first or 40.0, second or 40.0), {}),
+        kinds.SPHERE: (mesh.create_sphere, (first,), {}),
+        kinds.ELLIPSOID: (mesh.create_ellipsoid, (first, second, third), {}),
+        kinds.CAPSULE: (mesh.create_capsule, (first, second), upright),
+        kinds.CYLINDER: (mesh.create_cylinder, (first, second), upright),
+        kinds.CONE: (mesh.create_cone, (first, second), upright),
+        kinds.BOX: (mesh.create_box, (first, second, third), {}),
+    }
+    if kind == kinds.HFIELD:
         heights = source.min_z + np.asarray(source.data) * (source.max_z - source.min_z)
         # MuJoCo's rows are those along y
-        made = plain.create_heightfield(heights.T, 2 * source.hx, 2 * source.hy, ground_z=source.min_z - 0.1, **options)
-    elif kind in (kinds.MESH, kinds.CONVEX_MESH):
-        return np.asarray(source.vertices) * size, np.asarray(source.indices).reshape(-1, 3)
-    else:
+        sizes = heights.T, 2 * source.hx, 2 * source.hy
+        maker: Any = (mesh.create_heightfield, sizes, {"ground_z": source.min_z - 0.1})
+    elif (maker := makers.get(kind)) is None:
         return None
+    create, arguments, options = maker
+    made = create(*arguments, compute_inertia=False, **options)
     return np.asarray(made.vertices), np.asarray(made.indices).reshape(-1, 3)
+
+
+def stage_of(run: Run, worlds: int) -> tuple[Stage, dict[str, Any]]:
+    """The stage of a run's training worlds, and the ``train`` section of its job. Raises UserError."""
+    wp.config.log_level = wp.LOG_WARNING  # not a line for each kernel module
+    spec: dict[str, Any] = (run.description() or {}).get("spec") or {}
+    train = spec.get("train")
+    if not isinstance(train, dict) or not isinstance(train.get("task"), str):
+        raise UserError(f"run {run.name}: its description names no task")
+    train = with_texts(train, run, "train")
+    with user_errors():
+        task_type = find_task(train["task"])
+        return Stage(task_type, configure(task_type, train), worlds), train

@@ -1,27 +1,44 @@
-"""The tap: a ring on the device that holds the last control steps of a few worlds, filled inside the graph of a step.
+"""The tap: a ring on the device that holds the last control steps of a few worlds, filled inside the graph of a step; and its readers.
 
 Filling it is one launch that copies numbers and one that counts; nothing waits for the host, and nothing that the simulation reads is
 written. Body poses are not among the numbers: they follow from the joint coordinates, and whoever reads works them out
 (:class:`worker.telemetry.stage.Stage`), since kinematics in every step would cost a training more than all the rest.
+
+A reader of a training puts ``telemetry/request.json`` into the run's directory and finds the response in ``telemetry/tap.json``; the rows
+go through the machine's memory. Until the first request nothing is tapped; from then on the tap fills its ring to the end of the
+training, and a thread works while the reader lives.
 """
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 import warp as wp
 
+from shared_store.volume.files import read_json, write_json
+from shared_store.volume.layout import Run
+from worker.learning.hooks import Hook
+from worker.learning.reporter import Gate
 from worker.simulation.capture import on_torch_stream
 from worker.simulation.episodes import WATCHED, EpisodeArrays
 from worker.simulation.worlds import WorldArrays
-from worker.telemetry.rows import MARKS, Layout, Rows
+from worker.telemetry.rows import MARKS, Layout, Rows, Segment
+from worker.telemetry.tap_request import is_alive, request_of, response_of
 
 if TYPE_CHECKING:
+    from worker.learning.loop import Loop
     from worker.tasks.run.task import Task
+
 
 wp.set_module_options({"enable_backward": False})
 
@@ -108,44 +125,45 @@ class Tap:
         if not 1 <= worlds <= most:
             raise ValueError(f"worlds is {worlds}; of these worlds 1 to {most} can be watched")
         self.layout = Layout.of(task, worlds, rows, images)
+        self.left_out = ""
+        """The message about images that are too large for the ring; empty if none is missing."""
         self._task, self.device = task, task.device
-        self._seen = [wp.from_torch(task.groups[name].view(task.world_count, -1)) for name, *_ in self.layout.images]
+        self._sources = [wp.from_torch(task.groups[name].view(task.world_count, -1)) for name, *_ in self.layout.images]
         with on_torch_stream(self.device):
-            self._values = wp.zeros((rows, worlds, self.layout.width), dtype=wp.float32, device=self.device)
-            self._marks = wp.zeros((rows, worlds, len(MARKS)), dtype=wp.int32, device=self.device)
-            self._images = wp.zeros((rows, worlds, self.layout.image_bytes), dtype=wp.uint8, device=self.device)
-            self._ended = wp.zeros(worlds, dtype=wp.int32, device=self.device)
-            self._counter = wp.zeros(1, dtype=wp.int64, device=self.device)
+            self._values, self._marks, self._images, self._ended, self._counter = self._arrays = [
+                wp.zeros(shape, dtype=kind, device=self.device)
+                for shape, kind in (
+                    ((rows, worlds, self.layout.width), wp.float32),
+                    ((rows, worlds, len(MARKS)), wp.int32),
+                    ((rows, worlds, self.layout.image_bytes), wp.uint8),
+                    (worlds, wp.int32),
+                    (1, wp.int64),
+                )
+            ]
             self._ends = wp.array(self.layout.ends, dtype=wp.int32, device=self.device)
-        self.values: torch.Tensor = wp.to_torch(self._values)
-        self.marks: torch.Tensor = wp.to_torch(self._marks)
-        self.images: torch.Tensor = wp.to_torch(self._images)
-        self.count: torch.Tensor = wp.to_torch(self._counter)
+        tensors: list[torch.Tensor] = [wp.to_torch(each) for each in self._arrays]
+        self.values, self.marks, self.images, _, self.count = tensors
 
     @classmethod
     def within(cls, task: Task, worlds: int) -> Tap:
         """A ring whose images take at most :data:`IMAGE_MEMORY`: with fewer rows, or without images where too few would be left."""
         step = worlds * Layout.of(task, worlds, ROWS).image_bytes
         rows = min(ROWS, IMAGE_MEMORY // step) if step else ROWS
-        return cls(task, worlds, rows) if rows >= LEAST_ROWS else cls(task, worlds, images=False)
-
-    @property
-    def left_out(self) -> str:
-        """The message about images that are too large for the ring; empty if none is missing."""
-        worlds, most = self.layout.worlds, IMAGE_MEMORY // LEAST_ROWS
-        step = worlds * Layout.of(self._task, worlds, ROWS).image_bytes
-        if step == worlds * self.layout.image_bytes:
-            return ""
-        return (
+        if rows >= LEAST_ROWS:
+            return cls(task, worlds, rows)
+        tap = cls(task, worlds, images=False)
+        most = IMAGE_MEMORY / LEAST_ROWS
+        tap.left_out = (
             f"images are left out: of {worlds} worlds they take {step / 1e6:.1f} MB in each control step, and {most / 1e6:.1f} MB is the "
             "limit; fewer worlds (--worlds) or smaller images fit"
         )
+        return tap
 
     def open(self) -> None:
         """Have the task fill the ring from its next step on. A graph that holds the task's step has to be recorded anew."""
         with on_torch_stream(self.device):
             self._fill()  # loads the kernels, which a capture can't do everywhere
-            for array in (self._values, self._marks, self._images, self._ended, self._counter):
+            for array in self._arrays:
                 array.zero_()
         self._task.watch(self._fill)
 
@@ -160,7 +178,7 @@ class Tap:
         outputs = [self._values, self._marks]
         wp.launch(_fill, dim=shape, inputs=[*inputs, self._ended, self._counter], outputs=outputs, device=self.device)
         start = 0
-        for source, (_, *sizes) in zip(self._seen, self.layout.images, strict=True):
+        for source, (_, *sizes) in zip(self._sources, self.layout.images, strict=True):
             dim = (self.layout.worlds, math.prod(sizes))
             wp.launch(
                 _keep_image, dim, inputs=[source, start, self._counter], outputs=[self._images], device=self.device
@@ -178,13 +196,11 @@ class TapReader:
 
     def __init__(self, tap: Tap) -> None:
         self._tap = tap
-        self._cuda = tap.device.startswith("cuda")
-        self._stream = torch.cuda.Stream(tap.device) if self._cuda else None
-        self._values = torch.empty(tap.values.shape, dtype=torch.float32, pin_memory=self._cuda)
-        self._marks = torch.empty(tap.marks.shape, dtype=torch.int32, pin_memory=self._cuda)
-        self._images = torch.empty(tap.images.shape, dtype=torch.uint8, pin_memory=self._cuda)
-        self._pairs = (self._values, tap.values), (self._marks, tap.marks), (self._images, tap.images)
-        self._counts = torch.zeros(2, dtype=torch.int64, pin_memory=self._cuda)
+        cuda = tap.device.startswith("cuda")
+        self._stream = torch.cuda.Stream(tap.device) if cuda else None
+        sources = (tap.values, tap.marks, tap.images)
+        self._pairs = [(torch.empty(each.shape, dtype=each.dtype, pin_memory=cuda), each) for each in sources]
+        self._counts = torch.zeros(2, dtype=torch.int64, pin_memory=cuda)
         self.next = 0
         """Number of the step that is read next."""
 
@@ -193,16 +209,15 @@ class TapReader:
         the device overwrote meanwhile."""
         size, started = self._tap.layout.rows, self.next
         self._on_stream(lambda: self._counts[0:1].copy_(self._tap.count, non_blocking=True))
-        there = int(self._counts[0])
-        first = max(started, there - size + 1, there - (most or size))
-        self._on_stream(lambda: self._copy(first, there))
+        end = int(self._counts[0])
+        first = max(started, end - size + 1, end - (most or size))
+        self._on_stream(lambda: self._copy(first, end))
         # of what was copied, the device may have written over the oldest rows, and be at work on one more
-        first = min(there, max(first, int(self._counts[1]) - size + 1))
-        self.next = there
-        places = np.arange(first, there) % size
-        values, marks = self._values.numpy()[places], self._marks.numpy()[places]
-        images = self._images.numpy()[places] if self._tap.layout.images else None
-        return Rows(self._tap.layout, first, values, marks, first - started, images)
+        first = min(end, max(first, int(self._counts[1]) - size + 1))
+        self.next = end
+        places = np.arange(first, end) % size
+        values, marks, images = (copy.numpy()[places] for copy, _ in self._pairs)
+        return Rows(self._tap.layout, first, values, marks, images, first - started)
 
     def _copy(self, first: int, end: int) -> None:
         size = self._tap.layout.rows
@@ -221,3 +236,102 @@ class TapReader:
         with torch.cuda.stream(self._stream):
             copy()
         self._stream.synchronize()
+
+
+POLL_SECONDS = 1.0
+"""Between two polls for a request, or for the end of the reader."""
+DRAIN_SECONDS = 0.02
+"""Between two polls of the tap, while it has a reader."""
+NEWEST_SECONDS = 0.05
+"""The same, for a reader that needs the newest control step alone: a screen."""
+
+
+class LiveTap(Hook):
+    """Serves the tap of the main rank's worlds. :meth:`before_iteration` belongs to the training's thread, everything else to its own."""
+
+    _tap: Tap | None = None
+    _pending = 0
+    """Worlds that a request needs and the tap does not have yet."""
+    _thread: threading.Thread | None = None
+
+    def begin(self, loop: Loop) -> None:
+        if loop.gang.is_main:
+            self.serve(loop.job.run, loop.task, loop.gate)
+
+    def serve(self, run: Run, task: Task, gate: Gate) -> None:
+        """Start the thread.
+
+        Args:
+            run: The run.
+            task: Its worlds on this rank.
+            gate: Which keeps the thread from the interpreter while the training's needs it.
+        """
+        self._run, self._task, self._gate = run, task, gate
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="tap", daemon=True)
+        self._thread.start()
+
+    def before_iteration(self) -> bool:
+        """Open the tap if a request needs it."""
+        if not self._pending:
+            return False
+        tap = Tap.within(self._task, self._pending)
+        tap.open()
+        self._tap, self._pending = tap, 0
+        return True
+
+    def close(self) -> None:
+        """The training has ended, and so does what its reader gets."""
+        if self._thread is not None:
+            self._closing.set()
+            self._thread.join(5.0)
+
+    def _work(self) -> None:
+        while not self._closing.wait(POLL_SECONDS):
+            # a volume that is not reachable for a while, memory that is short: training goes on, and the reader reports what it misses
+            with contextlib.suppress(OSError, ValueError):
+                request = read_json(request_of(self._run))
+                if request is not None and not response_of(self._run).exists() and self._can_serve(request):
+                    self._send_rows(request)
+
+    def _can_serve(self, request: Mapping[str, Any]) -> bool:
+        """Whether the reader lives on this machine, and the tap has as many worlds as it needs."""
+        here = socket.gethostname()
+        if not is_alive(request.get("host"), request.get("process")):
+            if request.get("host") != here:
+                self._respond(problem=f"the training runs on {here}, and its rows do not leave that machine")
+            return False
+        worlds = request.get("worlds")
+        worlds = min(max(1, worlds if isinstance(worlds, int) else 1), WATCHED, self._task.world_count)
+        if self._tap is not None and self._tap.layout.worlds >= worlds:
+            return True
+        self._pending = worlds
+        return False
+
+    def _send_rows(self, request: Mapping[str, Any]) -> None:
+        """Until the reader or the training ends."""
+        assert self._tap is not None
+        reader = TapReader(self._tap)
+        reader.next = int(self._tap.count)
+        segment = Segment.create(self._tap.layout)
+        most, pause = (1, NEWEST_SECONDS) if request.get("newest") is True else (None, DRAIN_SECONDS)
+        polled, ended = time.monotonic(), False
+        try:
+            self._respond(path=str(segment.path), layout=asdict(self._tap.layout), note=self._tap.left_out)
+            while not ended:
+                ended = self._closing.wait(pause)
+                self._gate.wait()
+                if len(rows := reader.take(most)):
+                    segment.append(rows)
+                if time.monotonic() - polled >= POLL_SECONDS:
+                    polled = time.monotonic()
+                    ended = ended or not is_alive(request["host"], request["process"])
+        finally:
+            segment.close()
+        response_of(self._run).unlink(missing_ok=True)
+        newest = read_json(request_of(self._run)) or {}
+        if all(newest.get(key) == request[key] for key in ("host", "process")):  # else it is the next reader's
+            request_of(self._run).unlink(missing_ok=True)
+
+    def _respond(self, **response: Any) -> None:
+        write_json(response_of(self._run), {**response, "process": os.getpid()}, 0o600)

@@ -11,7 +11,6 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any
 
 from shared_store.process.tether import start_tied
@@ -36,14 +35,14 @@ class Tracking:
     def __init__(self, job: Job, *, is_main: bool) -> None:
         self.outcome = "failed"
         self._services: list[_Service] = []
-        wanted = job.spec.get("track") or {}
-        if not is_main or not wanted:
+        services = job.spec.get("track") or {}
+        if not is_main or not services:
             return
-        if not isinstance(wanted, dict) or not all(isinstance(each, dict | None) for each in wanted.values()):
+        if not isinstance(services, dict) or not all(isinstance(each, dict | None) for each in services.values()):
             raise UserError("track: expected a mapping of services, such as {wandb: {project: ant}}")
         from worker.telemetry.services import SERVICES
 
-        for name, settings in wanted.items():
+        for name, settings in services.items():
             if settings is None:
                 continue
             if name not in SERVICES:
@@ -66,11 +65,9 @@ class Tracking:
     def __enter__(self) -> Tracking:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         for service in self._services:
-            service.end(self.outcome)
+            service.send({"end": self.outcome})
         deadline = time.monotonic() + FAREWELL[self.outcome]
         for service in self._services:
             service.close(deadline)
@@ -90,7 +87,7 @@ class _Service:
             stdout=subprocess.PIPE,
             start_new_session=True,
         )
-        self._send(order)
+        self.send(order)
         threading.Thread(target=self._listen, name=f"tracking {name}", daemon=True).start()
 
     def check(self, deadline: float) -> None:
@@ -99,10 +96,6 @@ class _Service:
             self._say(f"warning: it is not ready after {READY_SECONDS:.0f} s; training begins")
         if self._refused is not None:
             raise UserError(f"track.{self._name}: {self._refused}")
-
-    def end(self, outcome: str) -> None:
-        """Have it send what is left."""
-        self._send({"end": outcome})
 
     def close(self, deadline: float) -> None:
         """Wait for its end, and end it."""
@@ -130,7 +123,8 @@ class _Service:
     def _say(self, text: str) -> None:
         print(f"{self._name}: {text}", flush=True)
 
-    def _send(self, words: Mapping[str, Any]) -> None:
+    def send(self, words: Mapping[str, Any]) -> None:
+        """Send its order, and at last how the training ended: it sends what is left then."""
         assert self._process.stdin is not None
         with contextlib.suppress(BrokenPipeError):  # it died: its thread has noticed
             self._process.stdin.write(json.dumps(words).encode() + b"\n")

@@ -37,17 +37,14 @@ def test_the_output_of_all_ranks_is_merged_with_rank_and_stream(node: Nodes) -> 
     assert time.time() - 20 * PATIENCE < outcome.started < outcome.ended <= time.time()
 
 
-def test_lines_are_in_the_log_while_the_rank_still_runs(node: Nodes) -> None:
+def test_lines_are_in_the_log_while_the_rank_still_runs_and_none_before_its_end_is_lost(node: Nodes) -> None:
     n = node()
-    n.start("sh", "-c", "echo now; sleep 60")
+    numbers = "for i in range(5000): print(f'{i:020d}')\nprint('no newline', end='')"
+    n.start(sys.executable, "-c", f"import time; print('now', flush=True); time.sleep(1)\n{numbers}")
     n.wait_for_output("now")
     assert n.process.poll() is None
-
-
-def test_nothing_that_was_printed_just_before_the_end_is_lost(node: Nodes) -> None:
-    n = node()
-    assert n.python("for i in range(5000): print(f'{i:020d}')\nprint('no newline', end='')") == 0
-    assert n.output() == [f"{i:020d}" for i in range(5000)] + ["no newline"]
+    assert n.wait() == 0
+    assert n.output() == ["now", *(f"{i:020d}" for i in range(5000)), "no newline"]
 
 
 def test_a_line_of_any_length_is_kept_whole_or_cut_but_never_lost(node: Nodes) -> None:
@@ -61,17 +58,13 @@ def test_a_line_of_any_length_is_kept_whole_or_cut_but_never_lost(node: Nodes) -
 
 
 @pytest.mark.parametrize("locale", ["C.UTF-8", "C", "POSIX"])
-def test_bytes_that_are_no_text_are_replaced_whatever_the_locale(node: Nodes, locale: str) -> None:
+def test_bytes_that_are_no_text_are_replaced_and_of_a_progress_bar_the_last_state_is_kept(
+    node: Nodes, locale: str
+) -> None:
     n = node()
-    script = r"printf 'a\377\376b\ngr\303\274n\n\000\n'"
+    script = r"printf 'a\377\376b\ngr\303\274n\n\000\n10%%\r20%%\r30%%\nwindows\r\n50%%\r60%%\r'"
     assert n.shell(script, LC_ALL=locale, PYTHONUTF8="0", PYTHONCOERCECLOCALE="0") == 0
-    assert n.output() == ["a\ufffd\ufffdb", "grün", "\0"]
-
-
-def test_of_a_progress_bar_the_last_state_is_kept(node: Nodes) -> None:
-    n = node()
-    assert n.shell(r"printf '10%%\r20%%\r30%%\nwindows\r\n50%%\r60%%\r'") == 0
-    assert n.output() == ["30%", "windows", "60%"]
+    assert n.output() == ["a\ufffd\ufffdb", "grün", "\0", "30%", "windows", "60%"]
 
 
 def test_a_log_that_can_not_be_written_does_not_stop_the_ranks(node: Nodes) -> None:
@@ -211,6 +204,7 @@ BY_ENGINE = "a node is started by one of Muster's engines"
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ({"EPOCH": ""}, "RUN/EPOCH: expected a whole number of at most 15 digits, found ''"),
         ({"MUSTER_JOB_ID": None}, f"MUSTER_JOB_ID is missing; {BY_ENGINE}"),
         ({"MUSTER_STORE": None}, f"MUSTER_STORE is missing; {BY_ENGINE}"),
         ({"MUSTER_EPOCH": "x"}, f"MUSTER_EPOCH is 'x', not a whole number; {BY_ENGINE}"),
@@ -224,19 +218,13 @@ def test_a_broken_contract_is_one_line(node: Nodes, tmp_path: Path, change: dict
     for name, value in change.items():
         if value is None:
             del n.environment[name]
+        elif name == "EPOCH":
+            (n.run.path / name).write_text(value)
         else:
             n.environment[name] = value
     assert n.call("touch", str(tmp_path / "started")) == 2
-    assert n.stderr.read_text() == f"muster supervisor: {said}\n"
+    assert n.stderr.read_text() == f"muster supervisor: {said.replace('RUN', str(n.run.path))}\n"
     assert not (tmp_path / "started").exists()
-
-
-def test_a_damaged_epoch_file_is_reported_in_one_line(node: Nodes) -> None:
-    n = node()
-    (n.run.path / "EPOCH").write_text("")
-    assert n.call("true") == 2
-    said = f"muster supervisor: {n.run.path}/EPOCH: expected a whole number of at most 15 digits, found ''\n"
-    assert n.stderr.read_text() == said
 
 
 def test_a_store_that_is_not_the_controllers_is_reported_before_any_start(node: Nodes, tmp_path: Path) -> None:

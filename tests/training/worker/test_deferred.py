@@ -20,7 +20,7 @@ weight.sum().backward()
 adam.step()
 adam.load_state_dict(adam.state_dict())
 assert "torch._dynamo.symbolic_convert" not in sys.modules, "an eager rank needs no compiler"
-import orchestrator.cli, orchestrator.cli.recordings, worker.telemetry.live_tap, worker.tasks.library.cartpole, newton
+import orchestrator.cli, orchestrator.cli.recordings, worker.telemetry.tap, worker.tasks.library.cartpole, newton
 assert "rerun" not in sys.modules, "neither the command nor a training needs it"
 torch.compile(lambda x: x * 2 + weight[0], backend="eager")(torch.ones(3))
 import torch._dynamo.config

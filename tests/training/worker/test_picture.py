@@ -11,7 +11,8 @@ from PIL import Image
 
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.picture import Glance, StageCamera, encode, pace, strip
+from worker.telemetry.messages import tiled
+from worker.telemetry.picture import STRIP, EpisodePicture, StageCamera, encode, pace
 from worker.telemetry.stage import Stage
 
 torch.set_num_threads(1)
@@ -55,7 +56,7 @@ def test_the_camera_follows_the_robot(camera: StageCamera) -> None:
 
 def test_a_strip_shows_its_pictures_row_by_row() -> None:
     pictures = [np.full((4, 6, 3), value, np.uint8) for value in range(6)]
-    whole = strip(pictures)
+    whole = tiled(pictures, *STRIP)
     assert whole.shape == (2 * 4 + 2, 3 * 6 + 2 * 2, 3)
     assert whole[0, [0, 8, 16], 0].tolist() == [0, 1, 2] and whole[6, [0, 8, 16], 0].tolist() == [3, 4, 5]
     assert (whole[4:6] == 255).all()
@@ -85,7 +86,7 @@ def test_a_film_runs_as_fast_as_the_simulated_time(ending: str, hertz: float, st
 
 def test_a_glance_shows_the_first_episode_of_an_evaluation_and_is_gone_after_it() -> None:
     task = Cartpole(CONFIG, 3, seed=2)
-    glance = Glance(task)
+    glance = EpisodePicture(task)
     task.reset()
     for _ in range(12):
         task.step(torch.ones(3, 1))

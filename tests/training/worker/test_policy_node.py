@@ -106,7 +106,7 @@ def test_the_node_reaches_the_return_of_the_direct_evaluation_in_real_time(
                 robot = open_robot(exported, messages, SEED)
                 node = Node(session, messages, name="simulated_robot")
                 lines: list[str] = []
-                found = play(robot, node, EPISODES, told=lines.append)
+                found = play(robot, node, EPISODES, report=lines.append)
                 node.close()
                 if all(int(steps) < 5 for steps in re.findall(r"(\d+) without a new command", "\n".join(lines))):
                     break

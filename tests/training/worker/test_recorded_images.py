@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import io
+import json
 import threading
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,11 +23,10 @@ from worker.learning.reporter import Gate
 from worker.settings.overrides import configured
 from worker.tasks.library.cartpole_pixels import CartpolePixels
 from worker.telemetry.live_recording import record
-from worker.telemetry.live_tap import Attending
 from worker.telemetry.live_view import TrainingView
 from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
-from worker.telemetry.tap import Tap, TapReader
+from worker.telemetry.tap import LiveTap, Tap, TapReader
 
 torch.set_num_threads(1)
 CONFIG = {"episode_seconds": 0.2, "camera": {"width": 12, "height": 8}}
@@ -45,14 +46,15 @@ class Running:
         self.run, self._task = run, task
         self.seen: list[np.ndarray] = []
         """Of each step the images of all worlds."""
-        self._attending = Attending(run, task, Gate())
+        self._tap = LiveTap()
+        self._tap.serve(run, task, Gate())
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._work)
         self._thread.start()
 
     def _work(self) -> None:
         while not self._over.wait(0.002):
-            self._attending.attend()
+            self._tap.before_iteration()
             self._task.step(torch.full((3, 1), float(len(self.seen))))
             self.seen.append(self._task.observations.numpy().copy())
 
@@ -63,13 +65,13 @@ class Running:
     def close(self) -> None:
         self._over.set()
         self._thread.join()
-        self._attending.close()
+        self._tap.close()
         self._task.watch(None)
 
 
 @pytest.fixture
 def running(task: CartpolePixels, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Running]:
-    monkeypatch.setattr("worker.telemetry.live_tap.LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     running = Running(task, Run(tmp_path / "run"))
     yield running
     running.close()
@@ -135,7 +137,7 @@ def test_images_that_are_too_large_are_left_out_and_one_line_says_so(
     monkeypatch.setattr("worker.telemetry.tap.IMAGE_MEMORY", 40 * step)
     tap = Tap.within(task, 2)
     assert (tap.layout.rows, tap.layout.images, tap.left_out) == (40, (("policy", 3, 8, 12),), "")
-    assert Layout.from_json(tap.layout.to_json()) == tap.layout
+    assert Layout.from_json(json.loads(json.dumps(asdict(tap.layout)))) == tap.layout
     monkeypatch.setattr("worker.telemetry.tap.IMAGE_MEMORY", 31 * step)
     tap = Tap.within(task, 2)
     assert (tap.layout.rows, tap.layout.images) == (1024, ())
@@ -144,5 +146,5 @@ def test_images_that_are_too_large_are_left_out_and_one_line_says_so(
     reading = TapReader(tap)
     task.step(torch.zeros(3, 1))
     rows = reading.take()
-    assert len(rows) == 1 and rows.images is None and rows.pictures(0) == {}
+    assert len(rows) == 1 and not rows.images.size and rows.pictures(0) == {}
     tap.close()

@@ -18,11 +18,9 @@ from tests.support.waiting import wait_for
 from worker.learning.reporter import Gate
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.live_tap import Attending
-from worker.telemetry.rows import MARKS, Layout, Rows
-from worker.telemetry.segment import Segment
-from worker.telemetry.tap import Tap, TapReader
-from worker.telemetry.tap_request import answer_of, request_of
+from worker.telemetry.rows import MARKS, Layout, Rows, Segment
+from worker.telemetry.tap import LiveTap, Tap, TapReader
+from worker.telemetry.tap_request import request_of, response_of
 
 torch.set_num_threads(1)
 SHORT = CartpoleConfig(episode_seconds=0.2)
@@ -116,7 +114,7 @@ LAYOUT = Layout(2, 8, 1, 1, ("seen",), ("done",), ("paid",), 50.0)
 def numbered(first: int, count: int) -> Rows:
     """Rows whose every value is the number of the step."""
     values = np.broadcast_to(np.arange(first, first + count, dtype=np.float32)[:, None, None], (count, 2, LAYOUT.width))
-    return Rows(LAYOUT, first, values, np.zeros((count, 2, len(MARKS)), np.int32))
+    return Rows(LAYOUT, first, values, np.zeros((count, 2, len(MARKS)), np.int32), np.zeros((count, 2, 0), np.uint8))
 
 
 def steps(segment: Segment) -> tuple[list[int], int]:
@@ -160,32 +158,34 @@ def test_memory_of_another_layout_is_refused(tmp_path: Path) -> None:
 def test_a_training_answers_a_request_between_two_iterations_and_stops_when_the_reader_is_gone(
     task: Cartpole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.telemetry.live_tap.LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     run = Run(tmp_path / "run")
-    attending = Attending(run, task, Gate())
-    assert not attending.attend()
+    tap = LiveTap()
+    tap.serve(run, task, Gate())
+    assert not tap.before_iteration()
     write_json(request_of(run), {"host": socket.gethostname(), "process": os.getpid(), "worlds": 40})
-    assert wait_for(attending.attend, 10, "the request")
-    told = wait_for(lambda: read_json(answer_of(run)), 10, "the answer")
+    assert wait_for(tap.before_iteration, 10, "the request")
+    told = wait_for(lambda: read_json(response_of(run)), 10, "the answer")
     layout = Layout.from_json(told["layout"])
-    assert layout.worlds == 6 and stat.S_IMODE(answer_of(run).stat().st_mode) == 0o600
+    assert layout.worlds == 6 and stat.S_IMODE(response_of(run).stat().st_mode) == 0o600
     segment = Segment.open(Path(told["path"]), layout)
     task.step(drawn(1))
     (rows,) = wait_for(lambda: list(segment.take()), 10, "the row")
     np.testing.assert_array_equal(rows.actions[0], drawn(1).numpy())
-    attending.close()
-    assert segment.closed and not Path(told["path"]).exists() and not answer_of(run).exists()
+    tap.close()
+    assert segment.closed and not Path(told["path"]).exists() and not response_of(run).exists()
     task.watch(None)
 
 
 def test_a_request_from_another_machine_is_answered_with_the_reason(
     task: Cartpole, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("worker.telemetry.live_tap.LOOK_SECONDS", 0.05)
+    monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     run = Run(tmp_path / "run")
-    attending = Attending(run, task, Gate())
+    tap = LiveTap()
+    tap.serve(run, task, Gate())
     write_json(request_of(run), {"host": "elsewhere", "process": 1, "worlds": 1})
-    told = wait_for(lambda: read_json(answer_of(run)), 10, "the answer")
+    told = wait_for(lambda: read_json(response_of(run)), 10, "the answer")
     assert told["problem"] == f"the training runs on {socket.gethostname()}, and its rows do not leave that machine"
-    assert not attending.attend()
-    attending.close()
+    assert not tap.before_iteration()
+    tap.close()

@@ -36,11 +36,8 @@ def shown(recorded: Recorded, tmp_path_factory: pytest.TempPathFactory) -> dict[
     replay = Replay(recorded.path)
     (part,) = replay.parts()
     file = tmp_path_factory.mktemp("shown") / "two.rrd"
-    screen = Screen(file, "two", replay.look, part.poses[0], live=False)
-    screen.frames(part.times, part.steps, part.poses, part.rewards)
-    screen.pictures("eye", *part.pictures("eye"))
-    screen.say(part.said)
-    screen.curve("episodes", [value for _, value in part.returns], np.array([at for at, _ in part.returns]), [])
+    screen = Screen(file, "two", replay.look, live=False)
+    screen.show(part)
     screen.close()
     found: dict[str, Any] = {}
     for chunk in RrdReader(file).stream().to_chunks():
@@ -63,7 +60,7 @@ def test_a_recording_reads_back_as_the_tap_s_rows(recorded: Recorded) -> None:
         np.testing.assert_allclose(part.rewards[number], rows.terms[0].mean(0), rtol=1e-6, atol=1e-7)
     returned = [sum(float(rows.rewards[0, world]) for rows in recorded.rows[:12]) for world in (0, 1)]
     np.testing.assert_allclose([value for _, value in part.returns[:2]], returned, rtol=1e-5)
-    assert sum("ended by time_out after 12 steps" in text for _, _, text in part.said) == 4
+    assert sum("ended by time_out after 12 steps" in text for _, _, text in part.log) == 4
 
 
 def test_a_recording_of_which_the_end_is_missing_is_shown_up_to_there(recorded: Recorded, tmp_path: Path) -> None:

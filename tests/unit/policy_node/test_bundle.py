@@ -11,11 +11,10 @@ import numpy as np
 import onnx
 import pytest
 
-from muster_policy.bundle import open_bundle
+from muster_policy.bundle import EXTERNAL, PARTS, open_bundle
 from muster_policy.cli import main
 from muster_policy.errors import Refused
 from muster_policy.policy import Policy
-from muster_policy.weights import EXTERNAL, PARTS
 from shared_store.volume.bundles import seal
 from tests.support.policy_node import write_bundle
 from tests.support.refusals import refusal

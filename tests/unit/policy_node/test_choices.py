@@ -13,22 +13,12 @@ from muster_policy.contract import read as node_read
 from muster_policy.errors import Refused
 from muster_policy.messages import Messages
 from muster_policy.observations import Observations
-from shared_store.contract.policy import Action, Contract, Group, Target, Term, read
+from shared_store.contract.policy import Action, Contract, Group, Target, read
 from tests.support.policy_node import for_node
+from tests.unit.policy_node.walker import term
 
-SEEN = Term(
-    "legs",
-    "measured",
-    0,
-    ("wheel",),
-    ("rad",),
-    (1.0,),
-    (0.0,),
-    quantity="joint_position",
-    element="joint",
-    elements=("wheel",),
-    library=True,
-)
+WHEEL = {"element": "joint", "elements": ("wheel",)}
+SEEN = term("joint_position", 0, 1, **WHEEL)
 
 
 def choosing(*targets: tuple[Target, ...]) -> Contract:

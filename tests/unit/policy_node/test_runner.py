@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from muster_policy import lines as module
+from muster_policy import timing as module
 from muster_policy.actions import Commands, limits
 from muster_policy.bundle import open_bundle
 from muster_policy.errors import Refused
 from muster_policy.inputs import Inputs
-from muster_policy.lines import Lines
 from muster_policy.messages import JOINT_STATE, Messages
 from muster_policy.observations import Observations
 from muster_policy.policy import Policy
 from muster_policy.runner import Mode, Runner
+from muster_policy.timing import Lines
 from shared_store.contract.policy import Action
 from tests.support.policy_node import for_node, write_bundle
 from tests.support.refusals import refusal
@@ -39,7 +39,7 @@ class Rig:
         policy.self_test(bundle.parity)
         observations = Observations(bundle.contract)
         self.inputs = Inputs(observations, MESSAGES)
-        self.given: list[float] = []
+        self.commanded: list[float] = []
         self.lines: list[str] = []
         self.runner = Runner(
             self.inputs,
@@ -47,7 +47,7 @@ class Rig:
             policy,
             Commands(bundle.contract),
             TIMEOUT,
-            lambda command: self.given.append(float(command.values[0])),
+            lambda command: self.commanded.append(float(command.values[0])),
             lambda line, warning: self.lines.append(line),
         )
 
@@ -72,8 +72,8 @@ def rig(tmp_path: Path) -> Rig:
 
 
 def test_nothing_is_commanded_before_all_inputs_have_come(rig: Rig) -> None:
-    assert not rig.step(0.0) and rig.given == []
-    assert rig.step(0.02, knee=0.4) and rig.given == [pytest.approx(0.3 + 0.5 * 0.4)]
+    assert not rig.step(0.0) and rig.commanded == []
+    assert rig.step(0.02, knee=0.4) and rig.commanded == [pytest.approx(0.3 + 0.5 * 0.4)]
     assert rig.lines == ["all inputs have arrived: it commands the joints now, in a new episode"]
 
 
@@ -81,22 +81,23 @@ def test_the_policy_observes_its_last_action_unclipped(rig: Rig) -> None:
     rig.step(0.0, knee=3.0)
     rig.step(0.02, knee=0.0)
     # asked for 3, clipped to 2 for the joint; then half of the 3 that it asked for
-    assert rig.given == [pytest.approx(0.3 + 0.5 * 2.0), pytest.approx(0.3 + 0.5 * 1.5)]
+    assert rig.commanded == [pytest.approx(0.3 + 0.5 * 2.0), pytest.approx(0.3 + 0.5 * 1.5)]
 
 
 def test_a_silent_input_stops_the_node_with_one_last_command_that_holds_the_joints(rig: Rig) -> None:
     rig.step(0.0, knee=0.4, position=0.1)
     assert rig.step(0.05), "not too old yet"
-    given = len(rig.given)
-    assert not rig.step(0.07) and rig.given[given:] == [pytest.approx(0.1)]
-    assert not rig.step(0.09) and len(rig.given) == given + 1, "and no further one"
+    given = len(rig.commanded)
+    assert not rig.step(0.07, knee=float("nan")) and rig.commanded[given:] == [pytest.approx(0.1)]
+    assert "joint_states: message ignored: not finite: its velocities" in rig.lines, "which is silence"
+    assert not rig.step(0.09) and len(rig.commanded) == given + 1, "and no further one"
     assert rig.lines[-1].startswith(
         "joint_states is silent for 70 ms: one last command holds the joints where they are"
     )
     assert "it resumes when no input has been older than 60 ms (--timeout) for 0.5 s" in rig.lines[-1]
     assert [rig.step(0.1 + 0.05 * step, knee=0.2) for step in range(9)] == [False] * 9
     assert rig.step(0.6, knee=0.2), "it goes on by itself"
-    assert rig.given[-1] == pytest.approx(0.3 + 0.5 * 0.2), "with a fresh episode: there is no last action"
+    assert rig.commanded[-1] == pytest.approx(0.3 + 0.5 * 0.2), "with a fresh episode: there is no last action"
 
 
 def test_an_input_slower_than_the_timeout_does_not_start_and_stop_the_robot_again_and_again(rig: Rig) -> None:
@@ -104,45 +105,39 @@ def test_an_input_slower_than_the_timeout_does_not_start_and_stop_the_robot_agai
     assert acted.count(True) == 4 and rig.runner.counts.stops == 1, "it acts until the first gap, and then no more"
 
 
-def test_messages_that_can_t_be_used_are_silence(rig: Rig) -> None:
-    rig.step(0.0, knee=0.4)
-    assert not rig.step(0.07, knee=float("nan")) and rig.given[-1] == pytest.approx(0.1)
-    assert "joint_states: message ignored: not finite: its velocities" in rig.lines
-
-
 def test_an_action_that_is_not_finite_is_never_commanded_and_stops_the_node_until_it_is_reset(tmp_path: Path) -> None:
     rig = Rig(tmp_path, weights=(1e36, 0.0, 0.0))
     assert not rig.step(0.0, knee=1e3), "more than 32 bits hold"
-    assert rig.given == [pytest.approx(0.1)] and rig.runner.mode is Mode.STOPPED
+    assert rig.commanded == [pytest.approx(0.1)] and rig.runner.mode is Mode.STOPPED
     assert rig.lines[-1].startswith("the policy's action for knee is not finite: one last command holds")
-    assert not rig.step(0.02, knee=0.0) and len(rig.given) == 1, "although it would be finite again"
+    assert not rig.step(0.02, knee=0.0) and len(rig.commanded) == 1, "although it would be finite again"
     rig.runner.reset()
-    assert rig.step(0.04, knee=0.0) and rig.given[-1] == pytest.approx(0.3)
+    assert rig.step(0.04, knee=0.0) and rig.commanded[-1] == pytest.approx(0.3)
 
 
 def test_an_observation_that_is_not_finite_is_never_given_to_the_policy(rig: Rig) -> None:
     assert not rig.step(0.0, knee=1e300), "a finite number of 64 bits that is infinite in 32"
-    assert rig.lines[-1].startswith("the observation obs is not finite") and rig.given == [pytest.approx(0.1)]
+    assert rig.lines[-1].startswith("the observation obs is not finite") and rig.commanded == [pytest.approx(0.1)]
 
 
 def test_a_reset_forgets_the_recurrent_state(tmp_path: Path) -> None:
     rig = Rig(tmp_path, weights=(1.0, 0.0, 0.0), recurrent=True)
     for step, total in enumerate((0.1, 0.2, 0.3)):
         rig.step(0.02 * step, knee=0.1)
-        assert rig.given[-1] == pytest.approx(0.3 + 0.5 * total)
+        assert rig.commanded[-1] == pytest.approx(0.3 + 0.5 * total)
     rig.runner.reset()
     rig.step(0.06, knee=0.1)
-    assert rig.given[-1] == pytest.approx(0.3 + 0.5 * 0.1)
+    assert rig.commanded[-1] == pytest.approx(0.3 + 0.5 * 0.1)
 
 
 def test_the_end_holds_the_joints_where_the_node_commands_them(rig: Rig, tmp_path: Path) -> None:
     idle = Rig(tmp_path / "idle")
     rig.step(0.0, knee=0.4)
     idle.runner.end("the node ends")
-    assert (idle.given, idle.lines, idle.step(0.01, knee=0.4)) == ([], [], False), "before it commanded anything"
+    assert (idle.commanded, idle.lines, idle.step(0.01, knee=0.4)) == ([], [], False), "before it commanded anything"
     rig.runner.end("the node ends")
     assert rig.lines[-1] == "the node ends: one last command holds the joints where they are"
-    assert rig.given[-1] == pytest.approx(0.1) and not rig.step(0.01, knee=0.4)
+    assert rig.commanded[-1] == pytest.approx(0.1) and not rig.step(0.01, knee=0.4)
 
 
 def test_commands_stay_within_limits() -> None:

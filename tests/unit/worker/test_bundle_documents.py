@@ -1,4 +1,4 @@
-"""Further documents of a bundle: plain names that no other file has, whoever brings them; else one line that says who."""
+"""Further documents of a bundle: plain names that no other file has, from the task or a plug-in; else one line that names it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
+from shared_store.contract import plugins as contract
 from shared_store.contract.plugins import Plugin, PluginError
-from worker.deploy import bundle_documents as module
-from worker.deploy.bundle_documents import bundle_documents
+from worker.deploy import bundle
 from worker.settings.errors import UserError
 from worker.tasks.library.cartpole import Cartpole
 
@@ -28,63 +28,19 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
     names = ("first", "second")
     PARTS.clear()
     PARTS.update({f"{name}:parts": lambda task: {} for name in names})
-    monkeypatch.setattr(module, "plugins", lambda: {name: Plugin(bundle_parts=f"{name}:parts") for name in names})
-    monkeypatch.setattr(module, "load", PARTS.__getitem__)
+    for owner in (bundle, contract):
+        monkeypatch.setattr(owner, "plugins", lambda: {name: Plugin(bundle_parts=f"{name}:parts") for name in names})
+    monkeypatch.setattr(bundle, "load", PARTS.__getitem__)
 
 
 def documents() -> dict[str, Any]:
-    return bundle_documents(Documented.__new__(Documented), "ppo")
+    return bundle.bundle_documents(Documented.__new__(Documented), "ppo")
 
 
 def test_the_task_and_each_plug_in_add_documents() -> None:
     PARTS["first:parts"] = lambda task: {"first.json": {"task": type(task).__name__}}
     PARTS["second:parts"] = lambda task: {"second.json": {}}
     assert documents() == {"task.json": {"algorithm": "ppo"}, "first.json": {"task": "Documented"}, "second.json": {}}
-
-
-NAMES = [
-    "../x.json",
-    "/x.json",
-    "a/b.json",
-    "..",
-    "",
-    ".json",
-    ".x.json",
-    "x.txt",
-    "policy.onnx",
-    "robot",
-    "x.json\n",
-    3,
-]
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_a_name_that_is_not_a_plain_one_is_refused(name: Any) -> None:
-    PARTS["first:parts"] = lambda task: {name: {}}
-    with pytest.raises(
-        UserError, match=r"plug-in first: bundle_parts: .* can't be a file of a bundle; use a plain name"
-    ):
-        documents()
-
-
-@pytest.mark.parametrize("name", ["contract.json", "report.json", "manifest.json"])
-def test_a_file_of_every_bundle_is_not_replaced(name: str) -> None:
-    PARTS["second:parts"] = lambda task: {name: {"evil": 1}}
-    with pytest.raises(UserError, match=rf"plug-in second: bundle_parts: {name} is a file of every bundle"):
-        documents()
-
-
-def test_two_documents_of_one_name_are_refused() -> None:
-    PARTS["first:parts"] = PARTS["second:parts"] = lambda task: {"notes.json": {}}
-    with pytest.raises(
-        UserError, match=r"plug-in second: bundle_parts: plug-in first: bundle_parts puts notes.json into"
-    ):
-        documents()
-    PARTS["second:parts"] = lambda task: {"task.json": {}}
-    with pytest.raises(
-        UserError, match=r"plug-in second: bundle_parts: task Documented: bundle_documents puts task.json"
-    ):
-        documents()
 
 
 def broken(task: Any) -> Any:
@@ -95,18 +51,35 @@ def absent(task: Any) -> Any:
     raise PluginError("plug-in: gone:parts can't be imported; install its package again")
 
 
+NAMES = (
+    *["../x.json", "/x.json", "a/b.json", "..", ".json", ".x.json", "x.txt", "policy.onnx", "robot"],
+    "",
+    "x.json\n",
+    3,
+)
+FIRST, SECOND = "plug-in first: bundle_parts:", "plug-in second: bundle_parts:"
+
+
 @pytest.mark.parametrize(
-    ("parts", "words"),
+    ("first", "second", "words"),
     [
-        (broken, r"plug-in first: bundle_parts: first:parts failed \(KeyError: 'worlds'\)"),
-        (absent, "gone:parts can't be imported"),
-        (lambda task: ["notes.json"], "first:parts returned .*; return documents by their names"),
-        (lambda task: {"notes.json": [1]}, "notes.json is not a JSON object"),
-        (lambda task: {"notes.json": {"a": object()}}, "notes.json is not a JSON object"),
+        *(({name: {}}, {}, f"{FIRST} .* can't be a file of a bundle; use a plain name") for name in NAMES),
+        *(
+            ({}, {name: {"evil": 1}}, f"{SECOND} {name} is a file of every bundle")
+            for name in ("contract.json", "report.json", "manifest.json")
+        ),
+        ({"notes.json": {}}, {"notes.json": {}}, f"{SECOND} {FIRST[:-1]} puts notes.json into"),
+        ({}, {"task.json": {}}, f"{SECOND} task Documented: bundle_documents puts task.json"),
+        (broken, {}, rf"{FIRST} first:parts failed \('worlds'\)"),
+        (absent, {}, "gone:parts can't be imported"),
+        (["notes.json"], {}, "first:parts returned .*; return documents by their names"),
+        ({"notes.json": [1]}, {}, "notes.json is not a JSON object"),
+        ({"notes.json": {"a": object()}}, {}, "notes.json is not a JSON object"),
     ],
 )
-def test_what_is_no_document_is_one_line(parts: Any, words: str) -> None:
-    PARTS["first:parts"] = parts
-    with pytest.raises(UserError, match=words) as refused:
+def test_what_is_no_document_of_its_own_is_refused_in_one_line(first: Any, second: Any, words: str) -> None:
+    PARTS["first:parts"] = first if callable(first) else lambda task: first
+    PARTS["second:parts"] = lambda task: second
+    with pytest.raises((UserError, PluginError), match=words) as refused:
         documents()
     assert "\n" not in str(refused.value)

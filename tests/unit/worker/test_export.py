@@ -24,11 +24,9 @@ from shared_store.volume.layout import Run
 from tests.support.worker.rsl_loop import GRU, GroupedPoint, build, train
 from tests.support.worker.sac import make, point
 from worker.deploy import bundle
-from worker.deploy.bundle import Files, _publish, bundle_files
-from worker.deploy.leapp_description import leapp_description
-from worker.deploy.model_file import OnnxPolicy, metadata_of, to_onnx
-from worker.deploy.parity import RecordedObservations
-from worker.deploy.rollouts import judge
+from worker.deploy.bundle import _publish, bundle_files
+from worker.deploy.model_file import OnnxPolicy, leapp_description, metadata_of, to_onnx
+from worker.deploy.parity import RecordedObservations, judge
 from worker.evaluation.episodes import Episodes
 from worker.learning.algorithm import ExportedPolicy
 from worker.learning.trained import load_policy
@@ -76,7 +74,7 @@ class Summing:
         return ExportedPolicy(Sum(self.tells, self.offset), {"obs": sample["policy"][:1], **state}, outputs, sample)
 
 
-def files_of(policy: Any) -> Files:
+def files_of(policy: Any) -> tuple[dict[str, bytes], dict[str, Any]]:
     """The files of a policy of two observations, compared with it on a made-up roll-out in which episodes begin anew."""
     exported = policy.module()
     states = tuple(State(name, f"{name}_out", tuple(exported.inputs[name].shape[1:])) for name in exported.states)
@@ -100,13 +98,13 @@ def test_a_memory_that_the_export_does_not_have_is_refused() -> None:
 
 
 def test_a_memory_that_the_export_has_is_compared_over_steps_and_resets() -> None:
-    files = files_of(Summing(tells=True))
-    told = np.load(io.BytesIO(files.parity))
+    files, report = files_of(Summing(tells=True))
+    told = np.load(io.BytesIO(files["parity.npz"]))
     # by hand: the second world's sum begins anew in step 4
     wanted = told["obs"].cumsum(0)
     wanted[4:, 1] = told["obs"][4:, 1].cumsum(0)
     np.testing.assert_allclose(told["actions"], wanted, atol=1e-5)
-    assert files.report["resets"] == 1 and files.report["observations"] == {"rollout": 18, "made_up": 48}
+    assert report["resets"] == 1 and report["observations"] == {"rollout": 18, "made_up": 48}
     with pytest.raises(TrainingError, match=r"^the exported policy \(onnx\) differs from the trained one by 0\.1"):
         files_of(Summing(tells=True, offset=0.1))
 
@@ -129,8 +127,14 @@ def recurrent() -> Any:
 
 
 def test_a_recurrent_policy_can_be_run_from_the_bundle_alone(tmp_path: Path, recurrent: Any) -> None:
-    """With numpy, onnxruntime and the contract, as on a robot."""
-    target = exported(Run(tmp_path / "run"), recurrent, GroupedPoint())
+    """With numpy, onnxruntime and the contract, as on a robot; it is judged on the same worlds as the policy."""
+    task = GroupedPoint()
+    target = exported(Run(tmp_path / "run"), recurrent, task, rounds=2)
+    judged = json.loads((target / "report.json").read_text())["judged"]
+    assert judged["episodes"] == 2 * task.world_count and judged["trained"]["std_return"] > 0.0
+    assert judged["bundle"]["mean_return"] == pytest.approx(judged["trained"]["mean_return"], abs=1e-3)
+    assert judged["bundle"]["mean_length"] == judged["trained"]["mean_length"]
+    assert judged["trained"]["success"] is None and "success" not in judged, "this task does not say what that is"
     contract = json.loads((target / "contract.json").read_text())
     assert contract["states"] == [{"name": "h", "output": "h_out", "shape": [1, 8]}]
     told = np.load(target / "parity.npz")
@@ -148,17 +152,6 @@ def test_a_recurrent_policy_can_be_run_from_the_bundle_alone(tmp_path: Path, rec
     assert one.shape[1] == 2 and 2 <= len(one) <= 4
     script = torch.jit.load(target / "policy.pt")
     np.testing.assert_allclose(script(torch.from_numpy(one), torch.from_numpy(zeros))[0].numpy(), found, atol=1e-5)
-
-
-def test_a_bundle_is_judged_on_the_same_worlds_as_the_policy(tmp_path: Path, recurrent: Any) -> None:
-    task = GroupedPoint()
-    target = exported(Run(tmp_path / "run"), recurrent, task, rounds=2)
-    judged = json.loads((target / "report.json").read_text())["judged"]
-    assert judged["episodes"] == 2 * task.world_count
-    assert judged["bundle"]["mean_return"] == pytest.approx(judged["trained"]["mean_return"], abs=1e-3)
-    assert judged["bundle"]["mean_length"] == judged["trained"]["mean_length"]
-    assert judged["trained"]["std_return"] > 0.0, "and it is worth comparing"
-    assert judged["trained"]["success"] is None and "success" not in judged, "this task does not say what that is"
 
 
 def test_a_bundle_that_does_worse_than_its_policy_is_not_published(
@@ -301,13 +294,13 @@ def test_leapp_itself_runs_the_bundle_as_it_is_described_over_steps_and_a_reset(
     pytest.importorskip("leapp", reason="pip install 'muster[leapp]', or make services")
     from leapp import InferenceManager
 
-    files = files_of(Summing(tells=True))
-    (tmp_path / "policy.onnx").write_bytes(files.onnx)
-    (tmp_path / "leapp.yaml").write_text(leapp_description(files.onnx, SUMMED))
+    files, _ = files_of(Summing(tells=True))
+    (tmp_path / "policy.onnx").write_bytes(files["policy.onnx"])
+    (tmp_path / "leapp.yaml").write_text(leapp_description(files["policy.onnx"], SUMMED))
     manager = InferenceManager(str(tmp_path / "leapp.yaml"))
     assert manager.inputs == ["policy/obs"] and manager.outputs == ["policy/actions"]
     assert manager.feedback_inputs == ["policy/total"]
-    told = np.load(io.BytesIO(files.parity))
+    told = np.load(io.BytesIO(files["parity.npz"]))
     for world in range(3):
         manager.reset()
         for step in range(len(told["begins"])):
@@ -321,7 +314,7 @@ def bundle_of(tmp_path: Path, kind: Any) -> tuple[Path, dict[str, Any]]:
     """A bundle of made-up policy files and of task ``kind``, whose worlds are not built: a robot is what its declaration says."""
     task: Any = kind.__new__(kind)
     task.config = kind.config_type()
-    files = Files(to_onnx(Summing(tells=False).module(), {}), b"", b"", {})
+    files = {"policy.onnx": to_onnx(Summing(tells=False).module(), {})}
     manifest = {"files": {}, "train": {}, "settings": {}}
     checkpoint: Any = SimpleNamespace(name="00000004-e1", iteration=4, manifest=manifest)
     run = Run(tmp_path / "run")

@@ -20,14 +20,14 @@ from shared_store.volume.metrics import MetricsWriter, scalars
 from tests.conftest import REPOSITORY
 from worker import track
 from worker.learning.job import Job
-from worker.telemetry.services import TrainingEnd
+from worker.telemetry.services import Service, TrainingEnd
 from worker.telemetry.tracking_processes import Tracking
-from worker.track import Sender, Turn
+from worker.track import Sender, SenderLock
 
 TRAIN = {"task": "Cartpole", "ppo": {"learning_rate": 0.001}}
 
 
-class Memory:
+class Memory(Service):
     """A service that remembers what it was sent, by the name of the run."""
 
     def __init__(self) -> None:
@@ -117,16 +117,16 @@ def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(
     run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = (
-        "import sys; from pathlib import Path; from shared_store.volume.layout import Run; from worker.track import Turn; "
-        "turn = Turn(Run(Path(sys.argv[1])), 'mlflow'); print(turn.take(), flush=True); sys.stdin.read()"
+        "import sys; from pathlib import Path; from shared_store.volume.layout import Run; from worker.track import SenderLock; "
+        "lock = SenderLock(Run(Path(sys.argv[1])), 'mlflow'); print(lock.take(), flush=True); sys.stdin.read()"
     )
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     other = subprocess.Popen([sys.executable, "-c", code, str(run.path)], cwd=REPOSITORY, **pipes)
     try:
         assert other.stdout is not None and other.stdout.readline() == "None\n"
         holder = f"process {other.pid} on {socket.gethostname()}"
-        turn = Turn(run, "mlflow")
-        assert turn.take() == holder and Turn(run, "wandb").take() is None
+        lock = SenderLock(run, "mlflow")
+        assert lock.take() == holder and SenderLock(run, "wandb").take() is None
         described = {"run": run.name, "spec": {"train": TRAIN, "track": {"mlflow": {"uri": "x"}}}}
         write_json(run.path / "run.json", described)
         monkeypatch.setattr(track, "SERVICES", {"mlflow": lambda tracked, settings: Memory()})
@@ -136,7 +136,7 @@ def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(
         other.kill()  # as a rank's death would end it
         other.wait()
         other.communicate()
-    assert turn.take() is None and turn.take() is None
+    assert lock.take() is None and lock.take() is None
 
 
 def test_an_unreachable_service_is_reported_in_one_line_and_everything_is_sent_later(

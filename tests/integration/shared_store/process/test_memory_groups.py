@@ -16,7 +16,7 @@ from shared_store.process.memory_groups import killed_for_memory, limits_memory,
 from shared_store.process.shim import shimmed
 from shared_store.process.tether import tied
 from tests.conftest import REPOSITORY
-from worker.node.memory import MemoryLimit
+from worker.node.surroundings import MemoryLimit
 
 NAME = f"muster-test-memory-{os.getpid()}"
 SUPERVISOR = f"""

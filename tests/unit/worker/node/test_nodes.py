@@ -10,8 +10,8 @@ import pytest
 
 from shared_store.contract.node import NodeContract, job_variables
 from tests.conftest import wait_for
-from worker.node import lifeline
-from worker.node.lifeline import ChildEnd, Loss, MainEnd
+from worker.node import aws_batch as lifeline
+from worker.node.aws_batch import ChildEnd, Loss, MainEnd
 from worker.node.slurm import environment_of
 
 
