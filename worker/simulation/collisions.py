@@ -197,14 +197,9 @@ def _set_contact(builder: newton.ModelBuilder, shape: int, values: Mapping[str, 
     _values(builder, "condim")[shape] = values["condim"]
     _values(builder, "geom_priority")[shape] = values["priority"]
     if values["friction"] is not None:
-        given = values["friction"] if isinstance(values["friction"], Sequence) else (values["friction"],)
-        of_directions = (
-            builder.shape_material_mu,
-            builder.shape_material_mu_torsional,
-            builder.shape_material_mu_rolling,
-        )
-        for coefficient, of_shapes in zip(given, of_directions, strict=False):
-            of_shapes[shape] = float(coefficient)
+        friction = values["friction"] if isinstance(values["friction"], Sequence) else (values["friction"],)
+        for coefficient, direction in zip(friction, ("", "_torsional", "_rolling"), strict=False):
+            getattr(builder, f"shape_material_mu{direction}")[shape] = float(coefficient)
     if values["solref"] is not None:
         _values(builder, "solref")[shape] = wp.vec2(*values["solref"])
         _values(builder, "solref_mode")[shape] = SOLREF_AS_GIVEN
@@ -216,14 +211,14 @@ def _set_contact(builder: newton.ModelBuilder, shape: int, values: Mapping[str, 
 def _drop_stale_filters(builder: newton.ModelBuilder, before: Mapping[int, tuple[int, int] | None]) -> None:
     """Remove the pair filters that an importer derived from the file's masks, since new masks replace those."""
     parents = {frozenset(pair) for pair in zip(builder.joint_parent, builder.joint_child, strict=True)}
-    kept = []
-    for first, second in builder.shape_collision_filter_pairs:
+
+    def is_stale(first: int, second: int) -> bool:
         bodies = frozenset((builder.shape_body[first], builder.shape_body[second]))
-        old = before.get(first), before.get(second)
-        by_masks = old[0] is not None and old[1] is not None and not _touch(old[0], old[1])
-        if len(bodies) == 1 or bodies in parents or not by_masks:
-            kept.append((first, second))
-    builder.shape_collision_filter_pairs = kept
+        one, other = before.get(first), before.get(second)
+        return len(bodies) > 1 and bodies not in parents and bool(one and other and not _touch(one, other))
+
+    pairs = builder.shape_collision_filter_pairs
+    builder.shape_collision_filter_pairs = [pair for pair in pairs if not is_stale(*pair)]
 
 
 def _touch(first: tuple[int, int], second: tuple[int, int]) -> bool:

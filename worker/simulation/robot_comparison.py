@@ -11,18 +11,19 @@ import mujoco
 import newton
 import numpy as np
 
-from worker.simulation.robot_connections import (
+from worker.simulation.robot_behavior import RELATIVE, differing, dynamics, lost_margin, notes, stay_apart
+from worker.simulation.robot_elements import (
     TARGETS,
     Ends,
     actuator_ends,
+    count_of,
     equality_ends,
     held,
+    matrix,
     tendon_ends,
     tendon_numbers,
+    word_of,
 )
-from worker.simulation.robot_contacts import differing, lost_margin, notes, stay_apart
-from worker.simulation.robot_dynamics import RELATIVE, dynamics
-from worker.simulation.robot_elements import count_of, word_of
 from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import (
@@ -34,7 +35,6 @@ from worker.simulation.robot_values import (
     has_mask,
     inertia,
     length,
-    matrix,
     shown_value,
 )
 

@@ -14,17 +14,22 @@ import numpy as np
 
 from shared_store.contract.policy import RobotModel
 from worker.simulation.robot_comparison import ACTUATOR, ELSEWHERE, SHARED, TENDON, RobotDifference
-from worker.simulation.robot_connections import (
+from worker.simulation.robot_elements import (
     Ends,
     actuator_ends,
+    count_of,
     equality_ends,
     held,
+    kind_of,
+    matrix,
+    name_of,
     pair_ends,
+    short,
     tendon_ends,
     tendon_numbers,
+    word_of,
 )
-from worker.simulation.robot_elements import count_of, kind_of, name_of, short, word_of
-from worker.simulation.robot_values import effort, extent, freedoms, gravity, has_mask, inertia, matrix
+from worker.simulation.robot_values import effort, extent, freedoms, gravity, has_mask, inertia
 
 Values = dict[str, Any]
 """Values of one element by their names: numbers, arrays or words."""

@@ -13,8 +13,21 @@ import numpy as np
 import warp as wp
 
 from worker.simulation import carriers
-from worker.simulation.robot_connections import Ends, effective_geoms, equality_ends, pair_ends, tendon_ends
-from worker.simulation.robot_elements import Pairs, count_of, kind_of, name_of, names_of, paired, plain, short
+from worker.simulation.robot_elements import (
+    Ends,
+    Pairs,
+    count_of,
+    effective_geoms,
+    equality_ends,
+    kind_of,
+    name_of,
+    names_of,
+    pair_ends,
+    paired,
+    plain,
+    short,
+    tendon_ends,
+)
 from worker.simulation.robot_values import freedoms, gravity, without_contacts
 from worker.simulation.robot_view import dof_names, joint_of
 from worker.simulation.solver import Solver, is_slider, weigh_sliders

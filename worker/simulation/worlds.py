@@ -17,6 +17,7 @@ from worker.simulation.carriers import keep_inertias, unload
 from worker.simulation.collisions import share, share_ground
 from worker.simulation.drives import Drives, has_drives
 from worker.simulation.solver import Solver
+from worker.simulation.structs import filled
 from worker.simulation.terrain import Terrain
 from worker.simulation.terrain_arrays import Ground
 
@@ -166,22 +167,27 @@ class Worlds:
         self.timestep = timestep
         self.substeps = substeps
 
-        self.arrays = WorldArrays()
-        self.arrays.fastest = fastest
-        self.arrays.joint_q = self.state.joint_q.reshape((world_count, -1))
-        self.arrays.joint_qd = self.state.joint_qd.reshape((world_count, -1))
-        self.arrays.start_q = self.model.joint_q.reshape((world_count, -1))
-        self.arrays.start_qd = self.model.joint_qd.reshape((world_count, -1))
+        def rows(array: Any) -> Any:
+            return array.reshape((world_count, -1))
+
         self.drives = Drives(self.model, self.solver, world_count) if has_drives(self.model) else None
-        if self.drives is None:
-            self.arrays.controls = vars(self.control)["mujoco"].ctrl.reshape((world_count, -1))
-        else:
-            self.arrays.controls = self.drives.controls
+        if self.drives is not None:
             self.solver.before_substep = [self.drives.launch]
-        self.arrays.drives = self.solver.mjw_data.qfrc_actuator
-        self.arrays.warm_start = self.solver.mjw_data.qacc_warmstart
-        self.arrays.activations = self.solver.mjw_data.act
-        self.arrays.overflow = self.solver.mjw_data.overflow
+        data = self.solver.mjw_data
+        self.arrays: WorldArrays = filled(
+            WorldArrays,
+            device,
+            joint_q=rows(self.state.joint_q),
+            joint_qd=rows(self.state.joint_qd),
+            controls=self.drives.controls if self.drives else rows(vars(self.control)["mujoco"].ctrl),
+            drives=data.qfrc_actuator,
+            warm_start=data.qacc_warmstart,
+            activations=data.act,
+            start_q=rows(self.model.joint_q),
+            start_qd=rows(self.model.joint_qd),
+            overflow=data.overflow,
+            fastest=fastest,
+        )
 
     def simulate(self) -> None:
         """Advance all worlds by ``substeps`` physics steps; launches only, so that it can be captured.

@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 
 from shared_store.contract.policy_changes import robot_changes
+from tests.support.worker.robot_texts import read
 from worker.simulation import robot_comparison as robot_judge
 from worker.simulation import robot_identity
-from worker.simulation.robot_reading import Reading, ReadingOptions, read
+from worker.simulation.robot_reading import Reading
 
 ARM = """<mujoco><option {option}>{flag}</option><default><joint {joint}/><geom {geom}/></default>
 <asset><hfield name="f" size="1 1 .2 .1" nrow="2" ncol="2" elevation="0 1 0 {height}"/></asset>
@@ -77,7 +78,7 @@ CHANGES = {
 
 
 def arm(**changes: str) -> Reading:
-    return read(ReadingOptions(ARM.format(**{**PLAIN, **changes})))
+    return read(ARM.format(**{**PLAIN, **changes}))
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -111,21 +112,21 @@ def test_all_that_the_judge_compares_is_in_the_identity(monkeypatch: pytest.Monk
 
 def test_options_that_do_not_apply_do_not_count() -> None:
     texts = [ARM.format(**{**PLAIN, "option": option}) for option in ("", 'iterations="3" gravity="0 0 -3"')]
-    one, other = (read(ReadingOptions(text, options=False)).identity for text in texts)
+    one, other = (read(text, file_options=False).identity for text in texts)
     assert one == other
-    assert read(ReadingOptions(ARM.format(**{**PLAIN, "option": 'timestep="0.1"'}))).identity == arm().identity
+    assert read(ARM.format(**{**PLAIN, "option": 'timestep="0.1"'})).identity == arm().identity
 
 
 def test_an_accepted_difference_is_shown_and_is_in_the_identity() -> None:
     text = """<mujoco><option density="1"/><worldbody><body name="b"><joint name="j" axis="0 1 0"/><inertial pos="0 0 .1" mass="1"
 diaginertia="1 2 2.5"/><geom size=".1" fluidshape="ellipsoid"/></body></worldbody></mujoco>"""
     with pytest.raises(ValueError, match="accept=") as refused:
-        read(ReadingOptions(text))
+        read(text)
     pattern = str(refused.value).split("accept=('")[1].split("'")[0]
-    accepted = read(ReadingOptions(text, accept=(pattern, "model: *", "geom *", "joint *", "arm: mass")))
+    accepted = read(text, accept=(pattern, "model: *", "geom *", "joint *", "arm: mass"))
     element, _, field = pattern.rpartition(": ")
     assert any(note.startswith(f"accepted: {element}: {field} is ") for note in accepted.notes)
     assert "accept='arm: mass' matches no difference from the file" in accepted.notes
     assert field not in accepted.identity.elements[element]  # zeros of the robot that is built
-    plain = read(ReadingOptions(text.replace(' fluidshape="ellipsoid"', "")))
+    plain = read(text.replace(' fluidshape="ellipsoid"', ""))
     assert accepted.identity.elements[element] == plain.identity.elements[element]

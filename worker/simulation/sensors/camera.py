@@ -17,8 +17,9 @@ from shared_store.contract.error_text import nearest
 from worker.simulation.episodes import EpisodeArrays, random_stream
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.places import BodyFrame, place_pose
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.structs import views_of
 from worker.simulation.world_cameras import (
     displace,
     displaced,
@@ -145,8 +146,102 @@ def _stack_masks(
         push(camera.images, world, channel, channels, row, column, value, episodes.ages[world] == 0)
 
 
+class Camera(Sensor):
+    """:class:`CameraSensor` of some worlds.
+
+    It renders in :meth:`settle` alone, once a control step. Before that ``Worlds.update_bodies`` and ``Worlds.update_shapes`` must
+    have been called.
+
+    Attributes:
+        images: ``arrays.images`` as a torch tensor, uint8, shape ``(worlds, channels * frames, height, width)``.
+    """
+
+    def __init__(self, declared: CameraSensor, context: SensorContext) -> None:
+        super().__init__(context, declared.rows(context.views))
+        (place,) = declared.places(context.views)
+        self.declared, self._body = declared, place.body
+        count, size = self._count, (declared.height, declared.width)
+        self._stream = -_FIRST_STREAM - 2 * (zlib.crc32(context.name.encode()) % 2**19)
+        mount = wp.transform_multiply(place.pose, declared.mount)
+        self._place = wp.full(count, mount, dtype=wp.transform, device=self._device)
+        self._usual, self._mounts = wp.clone(self._place), wp.clone(self._place)
+        self.arrays = CameraArrays()
+        self.arrays.images = context.array((count, len(self.names), *size), wp.uint8)
+        self.arrays.depths = context.array((count, *(size if declared.kind == "depth" else (0, 0))), wp.float32)
+        self.arrays.poses = context.array((count,), wp.transform)
+        self.images: torch.Tensor = wp.to_torch(self.arrays.images)
+        self._light = wp.full(count, 1.0, dtype=wp.float32, device=self._device)
+        self._sensor = renderer(context.worlds.model, declared.samples)
+        self._rays = SensorCamera.compute_camera_rays_pinhole(
+            declared.width,
+            declared.height,
+            camera_fov=declared.fov,
+            sample_count=declared.samples,
+            device=self._device,
+        )
+        self._pixels = context.array((count, *size), wp.float32 if declared.kind == "depth" else wp.uint32)
+        if declared.kind == "segmentation":
+            self._channel_of = wp.array(self._owners(context), dtype=wp.int32, device=self._device)
+
+    def _owners(self, context: SensorContext) -> np.ndarray:
+        """The channel that shows each shape of the model, -1: none."""
+        channels = {name: index for index, name in enumerate(self.declared.channels(context.views))}
+        model, count = context.worlds.model, context.worlds.world_count
+        shapes = shapes_of_worlds(model)
+        one = np.full(shapes, -1, np.int32)
+        for name, view in context.views.items():
+            for shape, body in zip(view.geoms, view.geom_bodies, strict=True):
+                one[shape] = channels.get(name if body >= 0 else GROUND, -1)
+        rest = np.full(model.shape_count - count * shapes, channels.get(GROUND, -1), np.int32)
+        return np.concatenate([np.tile(one, count), rest])
+
+    def begin(self, randomize: Randomization) -> None:
+        """Draw each camera's permanent offsets after random streams are seeded; a second call draws the same.
+
+        Args:
+            randomize: How the worlds differ besides: ``camera_position``, ``camera_angle``, ``light``.
+        """
+        self._displace(self._stream, randomize.camera_position, randomize.camera_angle, self._place, self._usual)
+        if not self.declared.redraw:
+            own = self.declared.position_range, self.declared.angle_range
+            self._displace(self._stream - 1, *own, self._usual, self._mounts)
+        draw_light(randomize.light, self._episodes, self._light)
+
+    def _displace(
+        self, stream: int, position: Any, angle: Any, given: wp.array[wp.transform], poses: wp.array[wp.transform]
+    ) -> None:
+        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, given]
+        wp.launch(displace, dim=given.shape, inputs=inputs, outputs=[poses], device=self._device)
+
+    def settle(self) -> None:
+        """Render every world; an episode's first image also fills the earlier frames."""
+        declared, count = self.declared, self._mounts.shape
+        if declared.redraw:
+            ranges = [wp.vec3(*_three(declared.position_range)), wp.vec3(*_three(declared.angle_range))]
+            inputs = [*ranges, self._episodes, self._usual]
+            wp.launch(_redraw, dim=count, inputs=inputs, outputs=[self._mounts], device=self._device)
+        wp.launch(_follow, dim=count, inputs=[self._bodies, self._body, self._mounts, self.arrays], device=self._device)
+        output = {"depth": "forward_depth_image", "segmentation": "shape_index_image"}.get(declared.kind, "color_image")
+        image: dict[str, Any] = {output: self._pixels}
+        self._sensor.update(self._worlds.state, self.arrays.poses, self._rays, **image)
+        inputs = [self._pixels, self._episodes, self.arrays]
+        if declared.kind == "depth":
+            kernel, inputs = _stack_depth, [declared.near, declared.far, *inputs]
+        elif declared.kind == "segmentation":
+            kernel, inputs = _stack_masks, [len(self.names) // declared.frames, self._channel_of, *inputs]
+        else:
+            kernel = _stack_grey if declared.kind == "grey" else _stack_color
+            inputs = [self._pixels, self._light, self._episodes, self.arrays]
+        wp.launch(kernel, dim=self._pixels.shape, inputs=inputs, device=self._device)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """The images, the depths that rewards may read, and the camera poses of the running episodes."""
+        tensors = views_of(self.arrays, "images", *(("depths",) if self.declared.kind == "depth" else ()))
+        return tensors | ({"mounts": wp.to_torch(self._mounts)} if self.declared.redraw else {})
+
+
 @dataclass(frozen=True)
-class CameraSensor:
+class CameraSensor(SensorDeclaration):
     """A pinhole camera in every world, on a body, on a site, or fixed in the world.
 
     :class:`worker.tasks.declare.declaration.Image` makes an observation group of its images; terms read :class:`CameraArrays`. Bytes of each kind:
@@ -202,6 +297,7 @@ class CameraSensor:
     angle_range: float | tuple[float, float, float] = 0.0
     redraw: bool = False
     arrays_type: ClassVar[Any] = CameraArrays
+    sensor_type: ClassVar[Any] = Camera
 
     def __post_init__(self) -> None:
         kinds = (*CHANNELS, "segmentation")
@@ -259,8 +355,7 @@ class CameraSensor:
         Raises:
             ValueError: The body, site, robot or object is unknown.
         """
-        if self.body is not None or self.site is not None:
-            place_names(views, "CameraSensor", self.robot, bodies=self.body, sites=self.site)
+        self.places(views)
         channels = self.channels(views)
         return [f"{name}_{back}" if back else name for back in range(self.frames) for name in channels]
 
@@ -272,120 +367,11 @@ class CameraSensor:
         ahead = (self.position[0] + 1.0, self.position[1], self.position[2])
         return look(self.position, ahead if self.target is None else self.target)
 
-    def build(self, context: SensorContext) -> Camera:
-        """The cameras of these worlds.
-
-        Raises:
-            ValueError: The body, site, robot or object is unknown, or a pattern matches several.
-        """
-        place = BodyFrame("world", -1, wp.transform_identity())
-        if self.body is not None or self.site is not None:
-            place = only_one(find_places(context, "CameraSensor", self.robot, self.body, self.site), "CameraSensor")
-        return Camera(self, place, context)
-
-
-class Camera:
-    """:class:`CameraSensor` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    It renders in :meth:`settle` alone, once a control step. Before that ``Worlds.update_bodies`` and ``Worlds.update_shapes`` must
-    have been called.
-
-    Args:
-        declared: As a task declares it.
-        place: The frame that carries it.
-        context: The worlds.
-
-    Attributes:
-        images: ``arrays.images`` as a torch tensor, uint8, shape ``(worlds, channels * frames, height, width)``.
-    """
-
-    needs_bodies = False  # only after resets, where the task sees to it
-
-    def __init__(self, declared: CameraSensor, place: BodyFrame, context: SensorContext) -> None:
-        self.names = tuple(declared.rows(context.views))
-        self.declared, self._bodies, self._episodes = declared, context.bodies, context.episodes
-        self._worlds, self._device, self._body = context.worlds, context.device, place.body
-        count, size = context.worlds.world_count, (declared.height, declared.width)
-        self._stream = -_FIRST_STREAM - 2 * (zlib.crc32(context.name.encode()) % 2**19)
-        mount = wp.transform_multiply(place.pose, declared.mount)
-        self._place = wp.full(count, mount, dtype=wp.transform, device=self._device)
-        self._usual, self._mounts = wp.clone(self._place), wp.clone(self._place)
-        self.arrays = CameraArrays()
-        self.arrays.images = context.array((count, len(self.names), *size), wp.uint8)
-        self.arrays.depths = context.array((count, *(size if declared.kind == "depth" else (0, 0))), wp.float32)
-        self.arrays.poses = context.array((count,), wp.transform)
-        self.images: torch.Tensor = wp.to_torch(self.arrays.images)
-        self._light = wp.full(count, 1.0, dtype=wp.float32, device=self._device)
-        self._sensor = renderer(context.worlds.model, declared.samples)
-        self._rays = SensorCamera.compute_camera_rays_pinhole(
-            declared.width,
-            declared.height,
-            camera_fov=declared.fov,
-            sample_count=declared.samples,
-            device=self._device,
-        )
-        self._pixels = context.array((count, *size), wp.float32 if declared.kind == "depth" else wp.uint32)
-        if declared.kind == "segmentation":
-            self._channel_of = wp.array(self._owners(context), dtype=wp.int32, device=self._device)
-
-    def _owners(self, context: SensorContext) -> np.ndarray:
-        """The channel that shows each shape of the model, -1: none."""
-        channels = {name: index for index, name in enumerate(self.declared.channels(context.views))}
-        model, count = context.worlds.model, context.worlds.world_count
-        shapes = shapes_of_worlds(model)
-        one = np.full(shapes, -1, np.int32)
-        for name, view in context.views.items():
-            for shape, body in zip(view.geoms, view.geom_bodies, strict=True):
-                one[shape] = channels.get(name if body >= 0 else GROUND, -1)
-        rest = np.full(model.shape_count - count * shapes, channels.get(GROUND, -1), np.int32)
-        return np.concatenate([np.tile(one, count), rest])
-
-    def begin(self, randomize: Randomization) -> None:
-        """Draw each camera's permanent offsets after random streams are seeded; a second call draws the same.
-
-        Args:
-            randomize: How the worlds differ besides: ``camera_position``, ``camera_angle``, ``light``.
-        """
-        self._displace(self._stream, randomize.camera_position, randomize.camera_angle, self._place, self._usual)
-        if not self.declared.redraw:
-            own = self.declared.position_range, self.declared.angle_range
-            self._displace(self._stream - 1, *own, self._usual, self._mounts)
-        draw_light(randomize.light, self._episodes, self._light)
-
-    def _displace(
-        self, stream: int, position: Any, angle: Any, given: wp.array[wp.transform], poses: wp.array[wp.transform]
-    ) -> None:
-        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, given]
-        wp.launch(displace, dim=given.shape, inputs=inputs, outputs=[poses], device=self._device)
-
-    def advance(self) -> None:
-        """No-op: one image per step is taken, after resets."""
-
-    def settle(self) -> None:
-        """Render every world; an episode's first image also fills the earlier frames."""
-        declared, count = self.declared, self._mounts.shape
-        if declared.redraw:
-            ranges = [wp.vec3(*_three(declared.position_range)), wp.vec3(*_three(declared.angle_range))]
-            inputs = [*ranges, self._episodes, self._usual]
-            wp.launch(_redraw, dim=count, inputs=inputs, outputs=[self._mounts], device=self._device)
-        wp.launch(_follow, dim=count, inputs=[self._bodies, self._body, self._mounts, self.arrays], device=self._device)
-        output = {"depth": "forward_depth_image", "segmentation": "shape_index_image"}.get(declared.kind, "color_image")
-        image: dict[str, Any] = {output: self._pixels}
-        self._sensor.update(self._worlds.state, self.arrays.poses, self._rays, **image)
-        inputs = [self._pixels, self._episodes, self.arrays]
-        if declared.kind == "depth":
-            kernel, inputs = _stack_depth, [declared.near, declared.far, *inputs]
-        elif declared.kind == "segmentation":
-            kernel, inputs = _stack_masks, [len(self.names) // declared.frames, self._channel_of, *inputs]
-        else:
-            kernel = _stack_grey if declared.kind == "grey" else _stack_color
-            inputs = [self._pixels, self._light, self._episodes, self.arrays]
-        wp.launch(kernel, dim=self._pixels.shape, inputs=inputs, device=self._device)
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """The images, the depths that rewards may read, and the camera poses of the running episodes."""
-        tensors = views_of(self.arrays, "images", *(("depths",) if self.declared.kind == "depth" else ()))
-        return tensors | ({"mounts": wp.to_torch(self._mounts)} if self.declared.redraw else {})
+    def places(self, views: Mapping[str, RobotView]) -> list[BodyFrame]:
+        """The frame that carries it, the world's by default. Raises ValueError where there is none, or a pattern matches several."""
+        if self.body is None and self.site is None:
+            return [BodyFrame("world", -1, wp.transform_identity())]
+        return super().places(views)
 
 
 def _three(value: float | Sequence[float]) -> tuple[float, float, float]:

@@ -59,26 +59,26 @@ def _groups(declared: ContactSensor, view: RobotView, solid: set[int]) -> dict[s
     """The shapes of each column, by the column's name. ``solid`` are the shapes that can collide; matches without one are skipped."""
     if (declared.bodies is None) == (declared.geoms is None):
         raise ValueError("ContactSensor: give either bodies or geoms, a pattern or several, and not both")
-    of_bodies = declared.geoms is None
-    wanted = declared.bodies if of_bodies else declared.geoms
-    patterns = [wanted] if isinstance(wanted, str) else list(wanted or ())
-    names = view.body_names if of_bodies else view.geom_names
-    find = view.find_bodies if of_bodies else view.find_geoms
+    if declared.geoms is None:
+        wanted, names, find = declared.bodies, view.body_names, view.find_bodies
+        owned = [
+            [shape for shape, owner in zip(view.geoms, view.geom_bodies, strict=True) if owner == body]
+            for body in view.bodies
+        ]
+    else:
+        wanted, names, find, owned = declared.geoms, view.geom_names, view.find_geoms, [[geom] for geom in view.geoms]
     found: dict[int, list[int]] = {}
-    if not patterns:
-        find(patterns)  # which refuses that
-    for pattern in patterns:
-        matching = {index: _shapes_on(view, index) if of_bodies else [view.geoms[index]] for index in find(pattern)}
-        colliding = {index: measured for index, measured in matching.items() if not solid.isdisjoint(measured)}
+    for pattern in [wanted] if isinstance(wanted, str) or not wanted else wanted:
+        matching = find(pattern or ())
+        colliding = {index: owned[index] for index in matching if not solid.isdisjoint(owned[index])}
         if not colliding:
             what = ", ".join(names[index] for index in matching)
-            raise ValueError(f"ContactSensor: {what} of {view.name} has no geom that can collide; {_able(view, solid)}")
+            able = [name for name, shape in zip(view.geom_names, view.geoms, strict=True) if shape in solid]
+            raise ValueError(
+                f"ContactSensor: {what} of {view.name} has no geom that can collide; geoms that can: {', '.join(able) or 'none'}"
+            )
         found |= colliding
     return {names[index]: found[index] for index in sorted(found)}
-
-
-def _shapes_on(view: RobotView, body: int) -> list[int]:
-    return [shape for shape, owner in zip(view.geoms, view.geom_bodies, strict=True) if owner == view.bodies[body]]
 
 
 def _shapes_of_geoms(context: SensorContext) -> np.ndarray:
@@ -110,8 +110,3 @@ def _others(declared: ContactSensor, context: SensorContext, shapes: np.ndarray)
 def _choices(context: SensorContext, declared: ContactSensor | None = None) -> str:
     known: Sequence[str] = (GROUND, *context.views)
     return nearest(declared.against if declared else "", known) + " (None: anything)"
-
-
-def _able(view: RobotView, solid: set[int]) -> str:
-    names = [name for name, shape in zip(view.geom_names, view.geoms, strict=True) if shape in solid]
-    return f"geoms that can: {', '.join(names) or 'none'}"

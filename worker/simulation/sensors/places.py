@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import warp as wp
 
 from shared_store.contract.error_text import nearest
 from worker.simulation.robot_arrays import BodyArrays
-from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.sensor import SensorContext
+
+if TYPE_CHECKING:
+    from worker.simulation.robot_view import RobotView
 
 wp.set_module_options({"enable_backward": False})
+
+Patterns = str | Iterable[str] | None
 
 
 @dataclass(frozen=True)
@@ -30,79 +34,66 @@ class BodyFrame:
     pose: wp.transform
 
 
+def view_of(views: Mapping[str, RobotView], robot: str, what: str) -> RobotView:
+    """The robot or object of a name. Raises ValueError, which begins with ``what``, where there is none."""
+    if robot not in views:
+        raise ValueError(f"{what}: there is no robot {robot!r}; {nearest(robot, views)}")
+    return views[robot]
+
+
 def find_places(
-    context: SensorContext,
-    what: str,
-    robot: str,
-    bodies: str | Iterable[str] | None,
-    sites: str | Iterable[str] | None,
+    views: Mapping[str, RobotView], what: str, robot: str, bodies: Patterns, sites: Patterns
 ) -> list[BodyFrame]:
     """The frames of bodies or of sites.
 
     Args:
-        context: The worlds.
+        views: The robots and objects by name.
         what: Name of the sensor, for errors.
         robot: Name of the robot.
         bodies: Pattern or patterns of the bodies; give this or ``sites``.
         sites: Pattern or patterns of the sites.
 
     Raises:
-        ValueError: Neither or both are given, or one of them matches nothing.
+        ValueError: Neither or both are given, the robot is unknown, or a pattern matches nothing.
     """
     if (bodies is None) == (sites is None):
         raise ValueError(f"{what}: give either bodies or sites, a pattern or several, and not both")
-    view = context.view(robot, f"{what}.robot")
-    if sites is not None:
-        return [
-            BodyFrame(view.site_names[index], view.site_bodies[index], view.site_poses[index])
-            for index in view.find_sites(sites)
-        ]
-    assert bodies is not None  # as was checked above
-    return [
-        BodyFrame(view.body_names[index], view.bodies[index], wp.transform_identity())
-        for index in view.find_bodies(bodies)
-    ]
+    view = view_of(views, robot, f"{what}.robot")
+    if sites is None:
+        found = view.find_bodies(bodies or ())
+        return [BodyFrame(view.body_names[each], view.bodies[each], wp.transform_identity()) for each in found]
+    found = view.find_sites(sites)
+    return [BodyFrame(view.site_names[each], view.site_bodies[each], view.site_poses[each]) for each in found]
 
 
-def place_names(
-    views: Mapping[str, RobotView],
-    what: str,
-    robot: str,
-    *,
-    bodies: str | Iterable[str] | None = None,
-    sites: str | Iterable[str] | None = None,
-    geoms: str | Iterable[str] | None = None,
-) -> list[str]:
-    """The names that patterns match, before any worlds exist.
+def find_place(views: Mapping[str, RobotView], what: str, robot: str, body: str | None, site: str | None) -> BodyFrame:
+    """The frame of one body or site; arguments and errors as of :func:`find_places`, and a pattern must not match several."""
+    if (body is None) == (site is None):
+        raise ValueError(f"{what}: give either body or site, and not both")
+    places = find_places(views, what, robot, body, site)
+    if len(places) != 1:
+        raise ValueError(f"{what}: name one body or site; the pattern matches {', '.join(p.name for p in places)}")
+    return places[0]
 
-    Args:
-        views: The robots and objects by name.
-        what: Name of the sensor, for errors.
-        robot: Name of the robot.
-        bodies: Pattern or patterns of bodies; give one of these three.
-        sites: Pattern or patterns of sites.
-        geoms: Pattern or patterns of geoms.
+
+def place_names(views: Mapping[str, RobotView], what: str, robot: str, **patterns: Patterns) -> list[str]:
+    """The names that patterns of ``bodies``, ``sites`` or ``geoms`` match, one of which is given; other arguments as of :func:`find_places`.
 
     Raises:
         ValueError: None or several are given, the robot is unknown, or a pattern matches nothing.
     """
-    if robot not in views:
-        raise ValueError(f"{what}.robot: there is no robot {robot!r}; {nearest(robot, views)}")
-    view = views[robot]
-    kinds = {"bodies": (bodies, view.find_bodies, view.body_names), "sites": (sites, view.find_sites, view.site_names)}
-    kinds["geoms"] = (geoms, view.find_geoms, view.geom_names)
-    given = [(patterns, search, names) for patterns, search, names in kinds.values() if patterns is not None]
+    view = view_of(views, robot, f"{what}.robot")
+    given = {kind: found for kind, found in patterns.items() if found is not None}
     if len(given) != 1:
-        raise ValueError(f"{what}: give one of bodies, sites and geoms, as the sensor takes them, a pattern or several")
-    patterns, search, names = given[0]
-    return [names[index] for index in search(patterns)]
-
-
-def only_one(places: list[BodyFrame], what: str) -> BodyFrame:
-    """The only place. Raises ValueError where a pattern matches several."""
-    if len(places) != 1:
-        raise ValueError(f"{what}: name one body or site; the pattern matches {', '.join(p.name for p in places)}")
-    return places[0]
+        raise ValueError(f"{what}: give one of {' and '.join(patterns)}, a pattern or several")
+    kinds = {
+        "bodies": (view.find_bodies, view.body_names),
+        "sites": (view.find_sites, view.site_names),
+        "geoms": (view.find_geoms, view.geom_names),
+    }
+    ((kind, found),) = given.items()
+    search, names = kinds[kind]
+    return [names[index] for index in search(found)]
 
 
 @wp.func

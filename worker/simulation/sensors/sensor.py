@@ -1,17 +1,18 @@
-"""The interface of all sensors: declaration, construction, and the order of their launches."""
+"""What all sensors share: declaration, construction, and the order of their launches."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 import warp as wp
 
-from shared_store.contract.error_text import nearest
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
+from worker.simulation.sensors.places import BodyFrame, find_place, find_places, view_of
+from worker.simulation.structs import views_of
 from worker.simulation.worlds import Worlds
 
 if TYPE_CHECKING:
@@ -48,36 +49,39 @@ class SensorContext:
         return str(self.worlds.model.device)
 
     def view(self, name: str, what: str) -> RobotView:
-        """The robot or object of this name.
-
-        Args:
-            name: As in the declaration of the robot.
-            what: Sensor and argument that named it, for the error.
-
-        Raises:
-            ValueError: No robot or object has this name.
-        """
-        if name not in self.views:
-            raise ValueError(f"{what}: there is no robot {name!r}; {nearest(name, self.views)}")
-        return self.views[name]
+        """The robot or object of this name; ``what`` names sensor and argument for the ValueError where there is none."""
+        return view_of(self.views, name, what)
 
     def array(self, shape: tuple[int, ...], dtype: Any) -> wp.array[Any]:
         """A cleared array on the device of the worlds."""
         return wp.zeros(shape, dtype=dtype, device=self.device)
 
 
-class Sensor(Protocol):
-    """Measures all worlds; its methods are launches only, so that they can be captured.
+class Sensor:
+    """Measures all worlds; its methods are launches only, so that they can be captured. By default it measures nothing.
+
+    Args:
+        context: The worlds.
+        names: See below.
 
     Attributes:
         arrays: An instance of a Warp struct, one row per world. A term reads it through a parameter of the struct's type.
         needs_bodies: Whether body poses must be current (``Worlds.update_bodies``) when the methods below are called.
         names: Names of its columns: bodies, geoms or sites.
+        state: Fields of ``arrays`` that the next step reads.
     """
 
     arrays: Any
-    needs_bodies: bool
-    names: tuple[str, ...]
+    needs_bodies: bool = False
+    state: tuple[str, ...] = ()
+
+    def __init__(self, context: SensorContext, names: Iterable[str]) -> None:
+        self.names = tuple(names)
+        self._context, self._worlds, self._device = context, context.worlds, context.device
+        self._bodies, self._episodes, self._count = context.bodies, context.episodes, context.worlds.world_count
+
+    def _launch(self, kernel: wp.Kernel, dim: Any, *inputs: Any) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, device=self._device)
 
     def advance(self) -> None:
         """Measure, after the physics of a control step."""
@@ -87,32 +91,43 @@ class Sensor(Protocol):
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """Live views of the state that the next step reads, by name, each with leading dimension ``worlds``."""
+        return views_of(self.arrays, *self.state)
 
 
-class SensorDeclaration(Protocol):
+class SensorDeclaration:
     """Declaration of a sensor: an immutable value without arrays.
 
     Attributes:
-        arrays_type: Struct type of its ``arrays``.
+        arrays_type: Struct type of its sensor's ``arrays``.
+        sensor_type: Type of its sensor, made of the declaration and a :class:`SensorContext`.
     """
 
     arrays_type: ClassVar[Any]
+    sensor_type: ClassVar[Any]
+
+    def places(self, views: Mapping[str, RobotView]) -> list[BodyFrame]:
+        """The frames that its fields ``bodies`` or ``sites`` match, or the one that ``body`` or ``site`` names.
+
+        Raises:
+            ValueError: Neither or both are given, the robot is unknown, a pattern matches nothing, or several where one is meant.
+        """
+        own: Any = self
+        if hasattr(own, "body"):
+            return [find_place(views, type(self).__name__, own.robot, own.body, own.site)]
+        return find_places(views, type(self).__name__, own.robot, own.bodies, own.sites)
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """Name of each column, before any worlds exist.
 
         Raises:
-            ValueError: It names something unknown.
+            ValueError: It names something unknown, or a number is out of range.
         """
+        return [place.name for place in self.places(views)]
 
-    def build(self, context: SensorContext) -> Sensor:
-        """The sensor of these worlds.
+    def build(self, context: SensorContext) -> Any:
+        """The sensor of these worlds, of :attr:`sensor_type`.
 
         Raises:
-            ValueError: It names something unknown, or something that can't be measured.
+            ValueError: As :meth:`rows`, or something can't be measured.
         """
-
-
-def views_of(arrays: Any, *names: str) -> dict[str, torch.Tensor]:
-    """Live torch views of fields of a Warp struct, by name."""
-    return {name: wp.to_torch(getattr(arrays, name)) for name in names}
+        return self.sensor_type(self, context)
