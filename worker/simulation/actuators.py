@@ -81,11 +81,7 @@ class Actuator:
         return f"{type(self).__name__}({self.joints!r})"
 
     def row(self, numbers: Mapping[str, float]) -> dict[str, Any]:
-        """MuJoCo's and the model's own parameters of one joint's actuator.
-
-        Args:
-            numbers: The declaration's numbers for this joint.
-        """
+        """MuJoCo's and the model's own parameters of one joint's actuator, of the declaration's numbers for this joint."""
         raise NotImplementedError
 
 
@@ -190,14 +186,7 @@ def clear(builder: newton.ModelBuilder) -> None:
 def add(
     builder: newton.ModelBuilder, names: Sequence[str], dofs: Sequence[int], actuators: Iterable[Actuator], robot: str
 ) -> None:
-    """Give a builder of one robot its actuators.
-
-    Args:
-        builder: Holds the robot alone; it has no actuators yet.
-        names: Its joints of one degree of freedom.
-        dofs: Columns of these joints in ``joint_qd``.
-        actuators: Declarations.
-        robot: Its name, for errors.
+    """Give a builder of one robot its actuators; ``dofs`` are the columns in ``joint_qd`` of its joints of one degree of freedom.
 
     Raises:
         ValueError: A pattern matches nothing, two actuators drive one joint, or a number is given for only some of an actuator's joints.

@@ -75,14 +75,7 @@ def apply(
     collisions: Iterable[Collision],
     robot: str,
 ) -> None:
-    """Apply masks and contact parameters to a builder that holds only one robot.
-
-    Args:
-        builder: Of one robot.
-        names: Its geoms.
-        shapes: The index of each geom among the builder's shapes.
-        collisions: Declarations; later ones override earlier ones.
-        robot: Its name, for errors.
+    """Apply masks and contact parameters to a builder of one robot, whose geoms are ``shapes`` of these names; later ones override earlier ones.
 
     Raises:
         ValueError: A pattern matches no geom, or the masks of a geom are given by patterns none of which matches it.
@@ -124,12 +117,7 @@ def masks(builder: newton.ModelBuilder, shape: int) -> tuple[int, int] | None:
 
 
 def without_self(builder: newton.ModelBuilder, world: newton.ModelBuilder) -> None:
-    """Disable self-collisions of a builder's one robot; all other collisions stay enabled.
-
-    Args:
-        builder: Of one robot.
-        world: The rest of the world. The robot still collides with everything in it, and with robots added later.
-    """
+    """Disable self-collisions of a builder's one robot; it still collides with the rest of the ``world``, and with robots added later."""
     taken = {int(mask) for mask in _values(world, "contype").values() if mask != UNSET}
     bit = next(1 << bit for bit in range(FIRST_OWN_BIT, 31) if not any(mask >> bit & 1 for mask in taken))
     for shape, flags in enumerate(builder.shape_flags):
@@ -144,9 +132,6 @@ def share(template: newton.ModelBuilder) -> bool:
     Newton does that only for shapes of one file. Otherwise it derives masks from its own groups, which can't distinguish ``contype`` from
     ``conaffinity``.
 
-    Args:
-        template: Builder of one world, before replication.
-
     Returns:
         Whether all colliding shapes have masks. If some were added without masks, the world is left unchanged.
     """
@@ -158,11 +143,7 @@ def share(template: newton.ModelBuilder) -> bool:
 
 
 def share_ground(scene: newton.ModelBuilder) -> None:
-    """Give the ground shared by all worlds masks with the same meaning as theirs.
-
-    Args:
-        scene: Replicates of a template for which :func:`share` was true, then the ground.
-    """
+    """Give the ground shared by all worlds masks with the same meaning as theirs, replicates of a template for which :func:`share` is true."""
     domains = _values(scene, "collision_mask_domain")
     # a world's domain is its first shape that collides; MuJoCo's model is made of the first world and the ground
     first = next((shape for shape in sorted(domains) if scene.shape_world[shape] == 0), None)

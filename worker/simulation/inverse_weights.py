@@ -233,13 +233,9 @@ class InverseWeights:
         if self.whole:
             solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
             return
-        wp.launch(
-            _weigh,
-            dim=self._worlds.world_count,
-            inputs=[changed, self._tree, self._scratch],
-            outputs=[self._inertials],
-            device=self._worlds.model.device,
-        )
+        inputs = [changed, self._tree, self._scratch]
+        device = self._worlds.model.device
+        wp.launch(_weigh, dim=self._worlds.world_count, inputs=inputs, outputs=[self._inertials], device=device)
         # Limits of joints that are given as a stiffness, as in URDF and USD files, are scaled by the weight of the joint.
         solver._update_solref_from_invweight0()
 

@@ -7,8 +7,17 @@ from collections.abc import Iterable
 from typing import Any
 
 import mujoco
+import newton
 import numpy as np
+from newton.solvers import SolverMuJoCo
 
+CARRIER = "__carries_joint_"
+"""Part of the name of a body that only carries a joint: MuJoCo lets several joints stand between a body and its parent, each at another place.
+Newton has one joint for each body, so all but the last of them move a body without mass."""
+CARRIER_MASS = 1e-9
+"""Its mass until the model is compiled [kg]: MuJoCo's compiler demands some of every body that moves."""
+CARRIER_INERTIA = 4e-15
+"""Its moments of inertia until then [kg m^2], little more than the compiler's least."""
 Ends = tuple[tuple[str, int], ...]
 """Kind and index of each element that another one connects; the index is -1 where there is none."""
 TARGETS = {
@@ -39,13 +48,7 @@ def quaternion(matrix: Any) -> Any:
 
 
 def name_of(model: Any, kind: mujoco.mjtObj, index: int) -> str:
-    """An element's name, or one made of its kind and its number where the file gives none.
-
-    Args:
-        model: A compiled model, ``mujoco.MjModel``.
-        kind: Kind of the element.
-        index: Its index among those of its kind.
-    """
+    """Name of an element of a ``mujoco.MjModel``, or one made of its kind and its number where the file gives none."""
     name: str | None = mujoco.mj_id2name(model, kind, index)
     return name or f"{mujoco.mju_type2Str(kind)}_{index}"
 
@@ -208,3 +211,28 @@ def _of_sites(model: Any, equality: int) -> bool:
 
 def _wraps(model: Any, tendon: int) -> range:
     return range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+
+
+def is_carrier(label: str) -> bool:
+    """Whether the body with this label only carries a joint."""
+    return CARRIER in short(label)
+
+
+def keep_inertias(builder: newton.ModelBuilder) -> None:
+    """Let Newton leave moments of inertia as they are: MuJoCo's compiler judges them."""
+    builder.balance_inertia = False
+    builder.inertia_relative_tolerance = builder.inertia_correction = 0.0
+    builder.inertia_absolute_tolerance = 1e-30  # Newton wants more than 0
+
+
+def unload(model: newton.Model, solver: SolverMuJoCo) -> None:
+    """Take the mass from the carriers of a model, after its solver was built."""
+    bodies = [index for index, label in enumerate(model.body_label) if is_carrier(label)]
+    if not bodies:
+        return
+    arrays: tuple[Any, ...] = (model.body_mass, model.body_inv_mass, model.body_inertia, model.body_inv_inertia)
+    for array in arrays:
+        values = array.numpy()
+        values[bodies] = 0.0
+        array.assign(values)
+    solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)

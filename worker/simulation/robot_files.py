@@ -244,11 +244,7 @@ def named_options(file: RobotFile) -> set[str]:
 
 
 def asset_folders(source: str, kind: str) -> list[tuple[Path, str]]:
-    """Where an MJCF file, or the text of one, and the models that it attaches look for their assets.
-
-    Args:
-        source: Path or text of the file.
-        kind: ``"meshdir"`` or ``"texturedir"``.
+    """Where an MJCF file, or the text of one, and the models that it attaches look for assets of ``"meshdir"`` or ``"texturedir"``.
 
     Returns:
         Of each file: its folder, and the assets' folder inside of that as the file says it, the main file's first.
@@ -265,14 +261,7 @@ def asset_folders(source: str, kind: str) -> list[tuple[Path, str]]:
 
 
 def missing_asset(spec: Any, source: str, name: str, shown: str) -> ValueError:
-    """The error of a mesh or height field that MuJoCo can't open.
-
-    Args:
-        spec: The parsed file, ``mujoco.MjSpec``.
-        source: Path or text of the file.
-        name: The asset as MuJoCo says it, with the folder of the assets.
-        shown: The file's name, for errors.
-    """
+    """The error of a mesh or height field that MuJoCo can't open, by its ``name`` in MuJoCo's message, with the folder of the assets."""
     places = [(folder, os.path.normpath(inside)) for folder, inside in asset_folders(source, "meshdir")]
     without = [(folder, inside) for folder, inside in places if not (folder / name).is_file()]
     within = [each for each in without if Path(name).is_relative_to(each[1])]
@@ -309,12 +298,7 @@ def urdf_root(source: str, shown: str) -> ElementTree.Element:
 
 
 def urdf_mesh(source: str, name: str, shown: str) -> Path:
-    """Find a mesh that a URDF file names.
-
-    Args:
-        source: Path or text of the file.
-        name: As in the file: relative to it, ``file://…`` or ``package://NAME/…``.
-        shown: The file's name, for errors.
+    """Find a mesh that a URDF file names: relative to the file, ``file://…`` or ``package://NAME/…``.
 
     Raises:
         ValueError: It is missing, or it can't be found.

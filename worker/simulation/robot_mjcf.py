@@ -13,8 +13,10 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from worker.simulation import carriers
 from worker.simulation.robot_elements import (
+    CARRIER,
+    CARRIER_INERTIA,
+    CARRIER_MASS,
     TARGETS,
     Words,
     actuator_ends,
@@ -62,7 +64,7 @@ _FLAGS = ("limited", "gravcomp", "actearly", "active")
 def write(model: Any, *, named: Collection[str] = (), visuals: bool = True) -> str:
     """Write a compiled model as MJCF.
 
-    Of several joints of a body all but the last move carriers (:mod:`worker.simulation.carriers`), so that each keeps its own place,
+    Of several joints of a body all but the last move carriers (:data:`worker.simulation.robot_elements.CARRIER`), so that each keeps its own place,
     its order and its part in a tendon.
 
     Args:
@@ -175,8 +177,8 @@ class _Writer:
         place: dict[str, Any] = {"pos": model.body_pos[body], "quat": model.body_quat[body]}
         joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
         for index, joint in enumerate(joints[:-1]):
-            parent = _add(parent, "body", name=f"{name}{carriers.MARK}{index}", **place)
-            _add(parent, "inertial", pos=(0, 0, 0), mass=carriers.MASS, diaginertia=(carriers.INERTIA,) * 3)
+            parent = _add(parent, "body", name=f"{name}{CARRIER}{index}", **place)
+            _add(parent, "inertial", pos=(0, 0, 0), mass=CARRIER_MASS, diaginertia=(CARRIER_INERTIA,) * 3)
             self._write_joint(parent, joint)
             place = {}
         if model.body_mocapid[body] >= 0:

@@ -24,9 +24,8 @@ from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_comparison as robot_judge
 from worker.simulation import robot_files, robot_mjcf, robot_reference, robot_usd, robot_values
-from worker.simulation.carriers import keep_inertias
 from worker.simulation.robot_comparison import Comparison, RobotDifference
-from worker.simulation.robot_elements import short
+from worker.simulation.robot_elements import keep_inertias, short
 from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_identity import identity
 from worker.simulation.robot_reference import ReferenceModel

@@ -196,24 +196,24 @@ def _settle_ranges(model: Any) -> Iterator[str]:
 def _compiled(spec: Any, refusal: Callable[[Exception], ValueError], notes: list[str]) -> Any:
     """Compile, and where only inertias are impossible, once more with MuJoCo's own correction, which is noted."""
     with robot_files.quiet():
-        try:
-            return spec.compile()
-        except ValueError as error:
-            if "balanceinertia" not in str(error):
-                raise refusal(error) from error
-        spec.compiler.balanceinertia = True
-        try:
-            model = spec.compile()
-        except ValueError as error:
-            raise refusal(error) from error
+        for is_balanced in (False, True):
+            spec.compiler.balanceinertia |= is_balanced
+            try:
+                model = spec.compile()
+                break
+            except ValueError as error:
+                if is_balanced or "balanceinertia" not in str(error):
+                    raise refusal(error) from error
+    if not is_balanced:
+        return model
     for body in spec.bodies:
         moments = _moments(body)
         if body.explicitinertial and 2.0 * max(moments) > sum(moments) * (1.0 + 1e-9):
             listed = " ".join(f"{moment:.4g}" for moment in moments)
             corrected = " ".join(f"{moment:.4g}" for moment in model.body_inertia[body.id])
             notes.append(
-                f"body {name_of(model, mujoco.mjtObj.mjOBJ_BODY, body.id)}: no body has the principal moments of inertia {listed}, since one is greater than the sum of the "
-                f"others; they are {corrected} here (MuJoCo's balanceinertia)"
+                f"body {name_of(model, mujoco.mjtObj.mjOBJ_BODY, body.id)}: no body has the principal moments of inertia {listed}, "
+                f"since one is greater than the sum of the others; they are {corrected} here (MuJoCo's balanceinertia)"
             )
     return model
 

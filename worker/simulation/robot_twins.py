@@ -12,13 +12,13 @@ import newton
 import numpy as np
 import warp as wp
 
-from worker.simulation import carriers
 from worker.simulation.robot_elements import (
     Ends,
     Pairs,
     count_of,
     effective_geoms,
     equality_ends,
+    is_carrier,
     kind_of,
     name_of,
     names_of,
@@ -27,6 +27,7 @@ from worker.simulation.robot_elements import (
     plain,
     short,
     tendon_ends,
+    unload,
 )
 from worker.simulation.robot_values import freedoms, gravity, without_contacts
 from worker.simulation.robot_view import dof_names, joint_of
@@ -55,12 +56,13 @@ class Stepped:
 
     def __getattr__(self, name: str) -> Any:
         compiled = getattr(self._compiled, name)
-        if not isinstance(compiled, np.ndarray):
-            return compiled
-        shape, values = compiled.shape, getattr(self._model, name)
-        found = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
-        found = found[0] if found.size and found.ndim > len(shape) else found
-        return found.reshape(shape).astype(compiled.dtype)
+        if isinstance(compiled, np.ndarray):
+            shape, values = compiled.shape, getattr(self._model, name)
+            found = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+            found = found[0] if found.size and found.ndim > len(shape) else found
+            compiled = found.reshape(shape).astype(compiled.dtype)
+        vars(self)[name] = compiled  # so that this is called once
+        return compiled
 
 
 class Twins:
@@ -82,7 +84,7 @@ class Twins:
         solver = Solver(
             model, use_mujoco_cpu=True, separate_worlds=False, kinematic_switchable_roots=False, disable_sensors=True
         )
-        carriers.unload(model, solver)
+        unload(model, solver)
         self.built: Any = solver.mj_model
         self.body_indices = _column(solver.mjc_body_to_newton)
         """Index of each body of :attr:`built` among the builder's, -1 for the world."""
@@ -119,7 +121,7 @@ class Twins:
         names = {
             index: plain(self.built_body(index))
             for index in range(1, self.built.nbody)
-            if not carriers.is_carrier(self.built_body(index))
+            if not is_carrier(self.built_body(index))
         }
         return {0: 0} | paired(names_of(self.file, "body", range(1, self.file.nbody)), names)
 
@@ -192,6 +194,14 @@ class Twins:
             [self.in_file(ends(self.built, index)) for index in range(count_of(self.built, kind))],
         )
 
+    def pairs(self, kind: str) -> Pairs:
+        """The elements of a kind that both models have."""
+        if kind == "actuator":
+            return {index: index for index in range(min(self.file.nu, self.built.nu))}
+        names = {"body": "bodies", "equality": "equalities", "pair": "contact_pairs"}
+        found: Pairs = getattr(self, names.get(kind, f"{kind}s"))
+        return found
+
     def in_file(self, ends: Ends) -> Ends:
         """Ends in the built model by the indices of the same elements in the file; :data:`OTHER` where it has none."""
         return tuple((kind, self._indices(kind).get(index, OTHER) if index >= 0 else -1) for kind, index in ends)
@@ -202,8 +212,8 @@ class Twins:
             sites = {shape: site for site, shape in self.sites.items() if shape is not None}
             self._in_file[kind] = {site: sites.get(shape, OTHER) for site, shape in enumerate(self._site_shapes)}
         elif kind not in self._in_file:
-            pairs = {"body": "bodies", "joint": "joints", "geom": "geoms", "tendon": "tendons"}.get(kind)
-            self._in_file[kind] = {twin: index for index, twin in getattr(self, pairs).items()} if pairs else {}
+            known = kind in ("body", "joint", "geom", "tendon")
+            self._in_file[kind] = {twin: index for index, twin in self.pairs(kind).items()} if known else {}
         return self._in_file[kind]
 
     def shown_end(self, end: tuple[str, int]) -> str:
@@ -239,7 +249,7 @@ class Twins:
         """The bodies of :attr:`built` that carry further joints of a body, from the nearest on."""
         above = []
         parent = int(self.built.body_parentid[body])
-        while parent and carriers.is_carrier(self.built_body(parent)):
+        while parent and is_carrier(self.built_body(parent)):
             above.append(parent)
             parent = int(self.built.body_parentid[parent])
         return above

@@ -41,13 +41,8 @@ PARTS = {"inertial": ("mass", "inertia"), "collision": ("geometry",)}
 def specification(file: RobotFile, shown: str, notes: list[str]) -> tuple[Any, str]:
     """A URDF file as MuJoCo reads it, with links that only fixed joints hold as bodies of their own, and without visuals.
 
-    Args:
-        file: The file.
-        shown: Its name, for errors.
-        notes: Gets what a user should know of it, one sentence each.
-
     Returns:
-        The ``mujoco.MjSpec``, and what was taken of what is only seen.
+        The ``mujoco.MjSpec``, and what was taken of what is only seen. What a user should know is added to ``notes``, one sentence each.
 
     Raises:
         ValueError: The file is wrong; the message names the link or joint.

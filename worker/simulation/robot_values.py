@@ -124,12 +124,9 @@ def freedoms(model: Any, joint: int) -> int:
 
 
 def move_joint(twins: Sequence[tuple[Any, Any, int]], amount: float, random: np.random.Generator) -> None:
-    """Move a joint in several models by the same random amount, and let it move on.
+    """Move a joint in several models, each with data and the joint's index, by the same random amount, and let it move on.
 
-    Args:
-        twins: Model, data and the joint's index in each of them.
-        amount: Greatest displacement [m, rad], and a tenth of the greatest velocity [m/s, rad/s].
-        random: Draws them.
+    ``amount`` is the greatest displacement [m, rad], and a tenth of the greatest velocity [m/s, rad/s].
     """
     model, _, joint = twins[0]
     count = freedoms(model, joint)

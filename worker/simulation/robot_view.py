@@ -15,10 +15,9 @@ from newton.solvers import SolverMuJoCo
 
 from shared_store.contract.error_text import nearest
 from worker.simulation.actuators import Input
-from worker.simulation.carriers import is_carrier
 from worker.simulation.patterns import find
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
-from worker.simulation.robot_elements import short
+from worker.simulation.robot_elements import is_carrier, short
 from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.structs import filled
 from worker.simulation.worlds import Worlds
@@ -166,15 +165,7 @@ class RobotView:
         ]
 
     def need_ranges(self, joints: Iterable[int], purpose: str) -> None:
-        """Refuse joints without limits.
-
-        Args:
-            joints: Indices into :attr:`joint_names`.
-            purpose: What needs them, for the error: ``"reward joint_limits"``.
-
-        Raises:
-            ValueError: A joint has no lower or no upper limit.
-        """
+        """Raise ValueError where a joint has no lower or no upper limit, which ``purpose`` needs, such as ``"reward joint_limits"``."""
         missing = [joint for joint in joints if not all(map(math.isfinite, self.ranges[joint]))]
         self._refuse(missing, purpose, "limits of its position", "give it a range in the robot's file, or leave it out")
 

@@ -1,9 +1,10 @@
-"""Warp structs filled by the types of their fields, and their arrays as torch sees them."""
+"""Warp structs filled by the types of their fields, and arrays as torch and the host see them."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 import warp as wp
 
@@ -33,3 +34,10 @@ def filled(kind: Any, device: Any, zeros: tuple[int, ...] | None = None, **value
 def views_of(arrays: Any, *names: str) -> dict[str, torch.Tensor]:
     """Live torch views of fields of a Warp struct, by name."""
     return {name: wp.to_torch(getattr(arrays, name)) for name in names}
+
+
+def numbers(array: wp.array[Any] | None) -> np.ndarray:
+    """The content of an array that Newton declares as optional and every finished model has."""
+    assert array is not None
+    content: np.ndarray = array.numpy()
+    return content

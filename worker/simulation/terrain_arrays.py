@@ -134,11 +134,7 @@ class Ground:
         )
 
     def deal(self, episodes: EpisodeArrays) -> None:
-        """Put every world on its first patch; call it once, after the seed is set and before worlds are placed.
-
-        Args:
-            episodes: Of the task; ``random`` holds the seed and the global index of each world.
-        """
+        """Put every world on its first patch; call it once, after ``episodes.random`` is set and before worlds are placed."""
         inputs = [episodes, wp.float64(GOLDEN), self.arrays]
         wp.launch(_deal, dim=len(self.arrays.levels), inputs=inputs, device=self._device)
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import newton
@@ -13,9 +12,9 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from shared_store.contract.error_text import nearest
-from worker.simulation.carriers import keep_inertias, unload
 from worker.simulation.collisions import share, share_ground
 from worker.simulation.drives import Drives, has_drives
+from worker.simulation.robot_elements import keep_inertias, unload
 from worker.simulation.solver import Solver
 from worker.simulation.structs import filled
 from worker.simulation.terrain import Terrain
@@ -195,15 +194,10 @@ class Worlds:
         This updates joint coordinates but not body poses (:meth:`update_bodies`), which cost 2 to 3 % of a training and which tasks that
         read only joints don't need.
         """
-        with self._joints_alone():
-            self.solver.step(self.state, self.state, self.control, None, self.timestep)
-
-    @contextlib.contextmanager
-    def _joints_alone(self) -> Iterator[None]:
-        """The solver ends each step with the kinematics of all articulations: in here there are none."""
+        # the solver ends each step with the kinematics of all articulations: here there are none
         count, self.model.articulation_count = self.model.articulation_count, 0
         try:
-            yield
+            self.solver.step(self.state, self.state, self.control, None, self.timestep)
         finally:
             self.model.articulation_count = count
 

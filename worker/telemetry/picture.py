@@ -20,7 +20,7 @@ import warp as wp
 from newton.sensors import SensorCamera
 
 from worker.settings.errors import UserError
-from worker.simulation.on_host import numbers
+from worker.simulation.structs import numbers
 from worker.simulation.world_cameras import look
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Tap, TapReader

@@ -17,9 +17,9 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from worker.simulation import robot_files
-from worker.simulation.carriers import is_carrier
-from worker.simulation.on_host import numbers
+from worker.simulation.robot_elements import is_carrier
 from worker.simulation.robot_view import RobotView
+from worker.simulation.structs import numbers
 from worker.simulation.terrain import Terrain
 from worker.tasks.run.declared import DeclaredTask
 

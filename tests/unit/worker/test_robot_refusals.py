@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import UserDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,6 @@ from worker.simulation.actuators import (
 )
 from worker.simulation.collisions import Collision
 from worker.simulation.objects import Box, Capsule, Sphere
-from worker.simulation.patterns import resolve
 from worker.simulation.robot import Robot
 from worker.simulation.robot_view import RobotView
 
@@ -146,17 +144,6 @@ def test_a_file_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path, na
     assert all(part in said for part in parts.split(" ... ")), said
 
 
-def test_a_missing_mesh_of_an_mjcf_file(tmp_path: Path):
-    """Newton alone would build the robot without it."""
-    (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes" / "shank.stl").write_text("")
-    assets = '<compiler meshdir="meshes"/><asset><mesh name="shank" file="shnk.stl"/></asset>'
-    (tmp_path / "leg.xml").write_text(leg(assets, '<geom type="mesh" mesh="shank"/>'))
-    there = r"leg\.xml: its mesh shnk\.stl is missing in .*meshes; did you mean shank\.stl\?"
-    with pytest.raises(ValueError, match=there):
-        template(Robot(tmp_path / "leg.xml", actuators=(SERVO,)))
-
-
 @pytest.mark.parametrize(
     ("mesh", "words"),
     [
@@ -273,11 +260,6 @@ def test_an_option_of_the_solver_that_is_not_a_task_s_is_refused(options: dict[s
     with pytest.raises(ValueError, match=r"task Robot: solver_options: ") as error:
         task_with(mjcf('<motor joint="hinge"/>'), **options)(PendulumConfig(), 2)
     assert message in str(error.value) and "\n" not in str(error.value)
-
-
-def test_values_by_pattern_may_come_in_any_mapping() -> None:
-    values = UserDict({"left_*": 1.0, "*": 2.0})
-    assert resolve(["left_knee", "right_knee"], values, "joint") == [1.0, 2.0]
 
 
 def test_no_other_exception_than_a_value_error_escapes() -> None:
