@@ -153,7 +153,7 @@ def _weigh(changed: wp.array[wp.bool], tree: Tree, scratch: Scratch, inertials: 
             inertia = inertia - wp.outer(force, force) / diagonal
             scratch.forces[world, dof] = force
             scratch.diagonal[world, dof] = diagonal
-        # bodies of different trees have different origins, but nothing is asked of the world's own inertia
+        # bodies of different trees have different origins, but nothing depends on the inertia of the world
         scratch.matrices[world, parent] = scratch.matrices[world, parent] + inertia
 
     scratch.matrices[world, 0] = wp.spatial_matrix()

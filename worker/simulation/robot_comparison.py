@@ -210,9 +210,11 @@ def _sites(twins: Twins) -> Iterator[RobotDifference]:
         if shape is None:
             yield RobotDifference(element, "existence", "missing", "there")
             continue
-        position, turn = twins.built_site(shape)
-        yield from _unequal(element, "pos", position, file.site_pos[site], length(file))
-        yield from _unequal(element, "orientation", matrix(turn), matrix(file.site_quat[site]), 1.0)
+        pose: Any = twins.builder.shape_transform[shape]
+        x, y, z, *turn = map(float, [*pose])
+        yield from _unequal(element, "pos", (x, y, z), file.site_pos[site], length(file))
+        orientation = matrix((turn[3], *turn[:3]))
+        yield from _unequal(element, "orientation", orientation, matrix(file.site_quat[site]), 1.0)
 
 
 def _contacts(twins: Twins) -> Iterator[RobotDifference]:

@@ -74,13 +74,19 @@ class Twins:
 
     Attributes:
         file: The file's compiled model, ``mujoco.MjModel``.
+        builder: The builder.
         built: The compiled model of the builder, ``mujoco.MjModel``.
         stepped: The values of the same model that MuJoCo-Warp steps.
     """
 
     def __init__(self, reference: Any, builder: newton.ModelBuilder) -> None:
-        self.file, self._builder = reference, builder
-        model = _finalized(builder)
+        self.file, self.builder = reference, builder
+        gaps = builder.shape_gap  # as of the worlds
+        builder.shape_gap = [0.0 if gap == builder.rigid_gap else gap for gap in gaps]
+        try:
+            model = builder.finalize(device="cpu")
+        finally:
+            builder.shape_gap = gaps
         solver = Solver(
             model, use_mujoco_cpu=True, separate_worlds=False, kinematic_switchable_roots=False, disable_sensors=True
         )
@@ -105,15 +111,15 @@ class Twins:
 
     def built_body(self, index: int) -> str:
         """Name of a body of the built model."""
-        return short(self._builder.body_label[self.body_indices[index]]) if index else "world"
+        return short(self.builder.body_label[self.body_indices[index]]) if index else "world"
 
     def built_joint(self, index: int) -> str:
         """Name of a joint of the built model."""
         dof = self.dofs[index]
-        joint = joint_of(self._builder, dof)
-        if self._builder.joint_type[joint] in (newton.JointType.FREE, newton.JointType.BALL):
-            return short(self._builder.joint_label[joint])
-        return dof_names(self._builder, joint)[dof - self._builder.joint_qd_start[joint]]
+        joint = joint_of(self.builder, dof)
+        if self.builder.joint_type[joint] in (newton.JointType.FREE, newton.JointType.BALL):
+            return short(self.builder.joint_label[joint])
+        return dof_names(self.builder, joint)[dof - self.builder.joint_qd_start[joint]]
 
     @cached_property
     def bodies(self) -> Pairs:
@@ -139,7 +145,7 @@ class Twins:
         pairs: Pairs = {}
         for body, twin in self.bodies.items():
             names = {
-                geom: plain(short(self._builder.shape_label[self._shapes[geom]]))
+                geom: plain(short(self.builder.shape_label[self._shapes[geom]]))
                 for geom in there
                 if built.geom_bodyid[geom] == twin
             }
@@ -149,7 +155,7 @@ class Twins:
     @cached_property
     def sites(self) -> dict[int, int | None]:
         """Index among the builder's shapes of each site of :attr:`file`; None: it is missing."""
-        model, builder = self.file, self._builder
+        model, builder = self.file, self.builder
         file_names = names_of(model, "site", range(model.nsite))
         shapes = [shape for shape, flags in enumerate(builder.shape_flags) if flags & newton.ShapeFlags.SITE]
         found: dict[int, int | None] = {}
@@ -159,12 +165,6 @@ class Twins:
             pairs = paired(mine, {shape: plain(short(builder.shape_label[shape])) for shape in there})
             found |= {site: pairs.get(site) for site in mine}
         return found
-
-    def built_site(self, shape: int) -> tuple[Any, Any]:
-        """Position [m] and quaternion wxyz of a site in its body's frame."""
-        pose: Any = self._builder.shape_transform[shape]
-        numbers = [float(number) for number in pose]
-        return numbers[:3], [numbers[6], *numbers[3:6]]
 
     @cached_property
     def tendons(self) -> Pairs:
@@ -284,16 +284,6 @@ def _matched(*keys: tuple[Iterable[Hashable], Iterable[Hashable]]) -> Pairs:
             if index not in pairs and rest[key]:
                 pairs[index] = rest[key].pop(0)
     return pairs
-
-
-def _finalized(builder: newton.ModelBuilder) -> newton.Model:
-    """The builder's model, with the gaps of :class:`worker.simulation.worlds.Worlds`."""
-    gaps = builder.shape_gap
-    builder.shape_gap = [0.0 if gap == builder.rigid_gap else gap for gap in gaps]
-    try:
-        return builder.finalize(device="cpu")
-    finally:
-        builder.shape_gap = gaps
 
 
 def _column(array: Any) -> list[int]:

@@ -199,7 +199,9 @@ class Terrain:
         """
         along_x, along_y = self.cells
         points = (self.levels * along_x + 1) * (self.column_count * along_y + 1)
-        free = math.inf if device is None else _free_memory(device)
+        free = math.inf if device is None else psutil.virtual_memory().available
+        if device is not None and (target := wp.get_device(device)).is_cuda:
+            free = min(free, target.free_memory)
         most = min(free / BYTES_PER_POINT, POINT_LIMIT)
         if points > most:
             there = "" if device is None else f" of {free / 2**30:,.1f} GiB that are free"
@@ -278,13 +280,6 @@ def _add_box(
     return builder.add_shape_box(
         -1, xform=place, hx=half[0], hy=half[1], hz=0.5 * DEPTH, cfg=config, label=f"{LABEL}/{name}"
     )
-
-
-def _free_memory(device: str) -> float:
-    """Bytes that are free on the host, or on the device where it has less."""
-    free: float = psutil.virtual_memory().available
-    target = wp.get_device(device)
-    return min(free, float(target.free_memory)) if target.is_cuda else free
 
 
 ROUGH_KINDS: Mapping[Patch, float] = {

@@ -17,8 +17,7 @@ from shared_store.contract.error_text import nearest
 from worker.simulation.episodes import EpisodeArrays, random_stream
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, place_pose
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import BodyFrame, Sensor, SensorContext, SensorDeclaration, place_pose
 from worker.simulation.structs import views_of
 from worker.simulation.world_cameras import (
     displace,

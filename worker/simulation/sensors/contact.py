@@ -14,8 +14,7 @@ import warp as wp
 
 from shared_store.contract.error_text import nearest
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import place_names
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_names
 from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
@@ -313,15 +312,15 @@ def _groups(declared: ContactSensor, view: RobotView, solid: set[int]) -> dict[s
     if (declared.bodies is None) == (declared.geoms is None):
         raise ValueError("ContactSensor: give either bodies or geoms, a pattern or several, and not both")
     if declared.geoms is None:
-        wanted, names, find = declared.bodies, view.body_names, view.find_bodies
+        patterns, names, find = declared.bodies, view.body_names, view.find_bodies
         owned = [
             [shape for shape, owner in zip(view.geoms, view.geom_bodies, strict=True) if owner == body]
             for body in view.bodies
         ]
     else:
-        wanted, names, find, owned = declared.geoms, view.geom_names, view.find_geoms, [[geom] for geom in view.geoms]
+        patterns, names, find, owned = declared.geoms, view.geom_names, view.find_geoms, [[geom] for geom in view.geoms]
     found: dict[int, list[int]] = {}
-    for pattern in [wanted] if isinstance(wanted, str) or not wanted else wanted:
+    for pattern in [patterns] if isinstance(patterns, str) or not patterns else patterns:
         matching = find(pattern or ())
         colliding = {index: owned[index] for index in matching if not solid.isdisjoint(owned[index])}
         if not colliding:

@@ -15,8 +15,7 @@ import warp as wp
 from shared_store.contract.error_text import nearest
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.ik_kernels import Chain, IkArrays, begin_targets, move_frame
-from worker.simulation.sensors.places import BodyFrame
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import BodyFrame, Sensor, SensorContext, SensorDeclaration
 from worker.simulation.structs import filled, views_of
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")

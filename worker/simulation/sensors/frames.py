@@ -10,8 +10,15 @@ import warp as wp
 
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, find_place, place_pose, place_velocity
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import (
+    BodyFrame,
+    Sensor,
+    SensorContext,
+    SensorDeclaration,
+    find_place,
+    place_pose,
+    place_velocity,
+)
 from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})

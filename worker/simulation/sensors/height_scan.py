@@ -13,8 +13,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import place_pose
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_pose
 from worker.simulation.structs import filled
 from worker.simulation.terrain_arrays import TerrainArrays, flat_ground, ground_height
 

@@ -8,8 +8,14 @@ from typing import Any, ClassVar
 import warp as wp
 
 from worker.simulation.robot_arrays import BodyArrays
-from worker.simulation.sensors.places import BodyFrame, place_pose, place_velocity
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import (
+    BodyFrame,
+    Sensor,
+    SensorContext,
+    SensorDeclaration,
+    place_pose,
+    place_velocity,
+)
 from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})

@@ -11,8 +11,7 @@ import warp as wp
 
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import find_place, view_of
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, find_place, view_of
 from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})

@@ -14,8 +14,7 @@ from worker.simulation.kinematics import yaw_quaternion
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import ALIGNMENTS, FEW_POINTS, GridPattern, RingPattern
-from worker.simulation.sensors.places import place_pose
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_pose
 from worker.simulation.structs import filled
 from worker.simulation.world_cameras import renderer
 
@@ -162,8 +161,8 @@ class RayCaster(SensorDeclaration):
             raise ValueError(f"RayCaster.alignment is {self.alignment!r}; use one of {', '.join(ALIGNMENTS)}")
         for name, least in (("max_distance", 1e-9), ("start", 0.0)):
             if not least <= getattr(self, name) < math.inf:
-                wanted = "> 0" if least else ">= 0"
-                raise ValueError(f"RayCaster.{name} is {getattr(self, name)}; use a number of metres {wanted}")
+                bound = "> 0" if least else ">= 0"
+                raise ValueError(f"RayCaster.{name} is {getattr(self, name)}; use a number of metres {bound}")
         self.places(views)
         return [str(ray) for ray in range(len(self.rays()[0]))]
 

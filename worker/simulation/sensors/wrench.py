@@ -11,8 +11,7 @@ import warp as wp
 
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import place_names
-from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_names
 from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
