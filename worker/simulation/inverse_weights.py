@@ -214,18 +214,7 @@ class InverseWeights:
             (count, model.nv),
             matrices=wp.zeros((count, model.nbody), dtype=wp.spatial_matrixf, device=device),
         )
-        fields = {
-            "masses": "body_mass",
-            "centers": "body_ipos",
-            "frames": "body_iquat",
-            "moments": "body_inertia",
-            "armatures": "dof_armature",
-            "subtree_masses": "body_subtreemass",
-            "body_weights": "body_invweight0",
-            "dof_weights": "dof_invweight0",
-        }
-        own = {name: getattr(solver.mjw_model, field) for name, field in fields.items()}
-        self._inertials = filled(Inertials, device, **own)
+        self._inertials = inertials_of(solver)
 
     def update(self, changed: wp.array[wp.bool]) -> None:
         """Launches that bring the worlds with ``changed`` (shape ``(worlds,)``, bool) up to date; they can be captured."""
@@ -238,6 +227,16 @@ class InverseWeights:
         wp.launch(_weigh, dim=self._worlds.world_count, inputs=inputs, outputs=[self._inertials], device=device)
         # Limits of joints that are given as a stiffness, as in URDF and USD files, are scaled by the weight of the joint.
         solver._update_solref_from_invweight0()
+
+
+def inertials_of(solver: Solver) -> Any:
+    """The :class:`Inertials` of a solver: views of its own arrays."""
+    names = ("mass", "ipos", "iquat", "inertia", "subtreemass", "invweight0")
+    bodies = [getattr(solver.mjw_model, f"body_{name}") for name in names]
+    fields = ("masses", "centers", "frames", "moments", "subtree_masses", "body_weights")
+    own = dict(zip(fields, bodies, strict=True))
+    model = solver.mjw_model
+    return filled(Inertials, None, armatures=model.dof_armature, dof_weights=model.dof_invweight0, **own)
 
 
 def _tree(model: mujoco.MjModel, solver: Solver, device: wp.Device) -> Any:

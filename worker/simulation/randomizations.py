@@ -16,7 +16,7 @@ import warp as wp
 
 from worker.simulation.declared_randomization import DISTRIBUTIONS, MOMENTS, OPERATIONS, Randomize
 from worker.simulation.episodes import EpisodeArrays
-from worker.simulation.inverse_weights import InverseWeights
+from worker.simulation.inverse_weights import InverseWeights, inertials_of
 from worker.simulation.randomization_kernels import (
     STARTUP,
     Bodies,
@@ -243,7 +243,7 @@ class _BodyChanges:
 
     def __init__(self, drawn: list[_Drawn], worlds: Worlds) -> None:
         self.is_live = any(_is_live(each.entry) for each in drawn)
-        model, solver = worlds.model, worlds.solver
+        model = worlds.model
         self._device = model.device
         self._changes, bodies = _table(drawn, self._device)
         shape = (worlds.world_count, model.body_count // worlds.world_count)
@@ -262,15 +262,12 @@ class _BodyChanges:
             columns=[body_column(worlds, body) for body in bodies],
             inverse_masses=model.body_inv_mass.reshape(shape),
             inverse_inertias=model.body_inv_inertia.reshape(shape),
-            masses=solver.mjw_model.body_mass,
-            centers=solver.mjw_model.body_ipos,
-            moments=solver.mjw_model.body_inertia,
-            frames=solver.mjw_model.body_iquat,
         )
+        self._inertials = inertials_of(worlds.solver)
         self._shape = (worlds.world_count, len(bodies))
 
     def launch(self, changed: wp.array[wp.bool], draws: wp.array2d[wp.float32]) -> None:
-        inputs = [changed, self._changes, draws, self._defaults, self._values, self._fields]
+        inputs = [changed, self._changes, draws, self._defaults, self._values, self._fields, self._inertials]
         wp.launch(change_bodies, dim=self._shape, inputs=inputs, device=self._device)
 
 
