@@ -19,8 +19,7 @@ import warp as wp
 from worker.settings.task import TaskConfig
 from worker.simulation.robot import Robot
 from worker.simulation.robot_comparison import RobotDifference
-from worker.simulation.robot_connections import Ends, equality_ends, tendon_ends
-from worker.simulation.robot_elements import kind_of, name_of, short, word_of
+from worker.simulation.robot_elements import Ends, equality_ends, kind_of, name_of, short, tendon_ends, word_of
 from worker.simulation.robot_reading import AnotherRobot, Reading
 from worker.simulation.robot_values import shown_value
 from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs, is_limited, joint_of

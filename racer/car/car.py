@@ -17,7 +17,8 @@ from racer.tracks.circuit import BOX, Circuit
 from racer.tracks.road import road_arrays
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import RobotArrays
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import SensorContext
+from worker.simulation.structs import views_of
 from worker.simulation.worlds import WorldArrays
 
 if TYPE_CHECKING:

@@ -66,27 +66,22 @@ class Actuator:
 
     def __post_init__(self) -> None:
         for item in fields(self):
-            value = getattr(self, item.name)
+            value, is_positive = getattr(self, item.name), item.name in self.positive
             if item.name == "joints" or value is None:
                 continue
             for number in value.values() if isinstance(value, Mapping) else (value,):
-                least = "greater than 0" if item.name in self.positive else "0 or more"
-                if isinstance(number, bool) or not isinstance(number, int | float) or math.isnan(number) or number < 0:
-                    raise ValueError(f"{self._said()}: {item.name} must be {least}, not {number!r}")
-                if number == 0 and item.name in self.positive:
-                    raise ValueError(f"{self._said()}: {item.name} must be {least}, not {number!r}")
+                is_number = isinstance(number, int | float) and not isinstance(number, bool)
+                if not is_number or not number >= 0 or (is_positive and number == 0):
+                    least = "greater than 0" if is_positive else "0 or more"
+                    raise ValueError(f"{self}: {item.name} must be {least}, not {number!r}")
         if not isinstance(self.delay, int):
-            raise ValueError(f"{self._said()}: delay is a whole number of physics steps, not {self.delay!r}")
+            raise ValueError(f"{self}: delay is a whole number of physics steps, not {self.delay!r}")
 
-    def _said(self) -> str:
+    def __str__(self) -> str:
         return f"{type(self).__name__}({self.joints!r})"
 
     def row(self, numbers: Mapping[str, float]) -> dict[str, Any]:
-        """MuJoCo's and the model's own parameters of one joint's actuator.
-
-        Args:
-            numbers: The declaration's numbers for this joint.
-        """
+        """MuJoCo's and the model's own parameters of one joint's actuator, of the declaration's numbers for this joint."""
         raise NotImplementedError
 
 
@@ -191,41 +186,42 @@ def clear(builder: newton.ModelBuilder) -> None:
 def add(
     builder: newton.ModelBuilder, names: Sequence[str], dofs: Sequence[int], actuators: Iterable[Actuator], robot: str
 ) -> None:
-    """Give a builder of one robot its actuators.
-
-    Args:
-        builder: Holds the robot alone; it has no actuators yet.
-        names: Its joints of one degree of freedom.
-        dofs: Columns of these joints in ``joint_qd``.
-        actuators: Declarations.
-        robot: Its name, for errors.
+    """Give a builder of one robot its actuators; ``dofs`` are the columns in ``joint_qd`` of its joints of one degree of freedom.
 
     Raises:
         ValueError: A pattern matches nothing, two actuators drive one joint, or a number is given for only some of an actuator's joints.
     """
     driven: dict[int, Actuator] = {}
+    columns = {
+        "armature": builder.joint_armature,
+        "friction_loss": builder.joint_friction,
+        "viscous_damping": builder.joint_damping,
+    }
+    defaults = {key: each.default for key, each in builder.custom_attributes.items() if each.frequency == FREQUENCY}
     for actuator in actuators:
         try:
             joints = find(names, actuator.joints, f"joint of {robot}")
         except ValueError as error:
-            raise ValueError(f"{robot}: {actuator._said()}: {error}") from error
+            raise ValueError(f"{robot}: {actuator}: {error}") from error
         for joint in joints:
             if joint in driven:
                 raise ValueError(
-                    f"{robot}: two actuators drive the joint {names[joint]}: {driven[joint]._said()} and {actuator._said()}; "
+                    f"{robot}: two actuators drive the joint {names[joint]}: {driven[joint]} and {actuator}; "
                     "narrow the patterns of one"
                 )
             driven[joint] = actuator
         chosen = [names[joint] for joint in joints]
         numbers = _numbers(actuator, chosen, robot)
         for index, joint in enumerate(joints):
-            mine = {name: values[index] for name, values in numbers.items()}
-            _set_joint(builder, dofs[joint], mine)
+            mine = {name: each[index] for name, each in numbers.items()}
+            for name, values in columns.items():
+                if name in mine:
+                    values[dofs[joint]] = mine[name]
             row = actuator.row(mine) | {"muster:delay": actuator.delay}
             row["mujoco:actuator_trnid"] = wp.vec2i(dofs[joint], 0)
             row["mujoco:actuator_label"] = names[joint]
             row["mujoco:actuator_world"] = builder.current_world
-            builder.add_custom_values(**_all_values(builder) | row)
+            builder.add_custom_values(**defaults | row)
 
 
 def _numbers(actuator: Actuator, names: Sequence[str], robot: str) -> dict[str, list[float]]:
@@ -235,24 +231,14 @@ def _numbers(actuator: Actuator, names: Sequence[str], robot: str) -> dict[str, 
         value = getattr(actuator, item.name)
         if item.name in ("joints", "delay") or value is None:
             continue
-        resolved = resolve(names, value, f"joint of {actuator._said()} of {robot}")
+        resolved = resolve(names, value, f"joint of {actuator} of {robot}")
         for name, number in zip(names, resolved, strict=True):
             if number is None:
                 raise ValueError(
-                    f"{robot}: {actuator._said()}: no pattern of {item.name} matches the joint {name}; add '*' as the last one"
+                    f"{robot}: {actuator}: no pattern of {item.name} matches the joint {name}; add '*' as the last one"
                 )
         numbers[item.name] = [float(number) for number in resolved if number is not None]
     return numbers
-
-
-def _set_joint(builder: newton.ModelBuilder, dof: int, numbers: Mapping[str, float]) -> None:
-    for name, values in (
-        ("armature", builder.joint_armature),
-        ("friction_loss", builder.joint_friction),
-        ("viscous_damping", builder.joint_damping),
-    ):
-        if name in numbers:
-            values[dof] = numbers[name]
 
 
 def _native(kind: Any, gain: float, bias: Sequence[float] | None, effort_limit: float | None) -> dict[str, Any]:
@@ -276,11 +262,3 @@ def _native(kind: Any, gain: float, bias: Sequence[float] | None, effort_limit: 
         row["mujoco:actuator_forcelimited"] = row["mujoco:actuator_has_forcerange"] = 1
         row["mujoco:actuator_forcerange"] = wp.vec2(-effort_limit, effort_limit)
     return row
-
-
-def _all_values(builder: newton.ModelBuilder) -> dict[str, Any]:
-    return {
-        key: attribute.default
-        for key, attribute in builder.custom_attributes.items()
-        if attribute.frequency == FREQUENCY
-    }

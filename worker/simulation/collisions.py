@@ -75,14 +75,7 @@ def apply(
     collisions: Iterable[Collision],
     robot: str,
 ) -> None:
-    """Apply masks and contact parameters to a builder that holds only one robot.
-
-    Args:
-        builder: Of one robot.
-        names: Its geoms.
-        shapes: The index of each geom among the builder's shapes.
-        collisions: Declarations; later ones override earlier ones.
-        robot: Its name, for errors.
+    """Apply masks and contact parameters to a builder of one robot, whose geoms are ``shapes`` of these names; later ones override earlier ones.
 
     Raises:
         ValueError: A pattern matches no geom, or the masks of a geom are given by patterns none of which matches it.
@@ -124,12 +117,7 @@ def masks(builder: newton.ModelBuilder, shape: int) -> tuple[int, int] | None:
 
 
 def without_self(builder: newton.ModelBuilder, world: newton.ModelBuilder) -> None:
-    """Disable self-collisions of a builder's one robot; all other collisions stay enabled.
-
-    Args:
-        builder: Of one robot.
-        world: The rest of the world. The robot still collides with everything in it, and with robots added later.
-    """
+    """Disable self-collisions of a builder's one robot; it still collides with the rest of the ``world``, and with robots added later."""
     taken = {int(mask) for mask in _values(world, "contype").values() if mask != UNSET}
     bit = next(1 << bit for bit in range(FIRST_OWN_BIT, 31) if not any(mask >> bit & 1 for mask in taken))
     for shape, flags in enumerate(builder.shape_flags):
@@ -144,9 +132,6 @@ def share(template: newton.ModelBuilder) -> bool:
     Newton does that only for shapes of one file. Otherwise it derives masks from its own groups, which can't distinguish ``contype`` from
     ``conaffinity``.
 
-    Args:
-        template: Builder of one world, before replication.
-
     Returns:
         Whether all colliding shapes have masks. If some were added without masks, the world is left unchanged.
     """
@@ -158,11 +143,7 @@ def share(template: newton.ModelBuilder) -> bool:
 
 
 def share_ground(scene: newton.ModelBuilder) -> None:
-    """Give the ground shared by all worlds masks with the same meaning as theirs.
-
-    Args:
-        scene: Replicates of a template for which :func:`share` was true, then the ground.
-    """
+    """Give the ground shared by all worlds masks with the same meaning as theirs, replicates of a template for which :func:`share` is true."""
     domains = _values(scene, "collision_mask_domain")
     # a world's domain is its first shape that collides; MuJoCo's model is made of the first world and the ground
     first = next((shape for shape in sorted(domains) if scene.shape_world[shape] == 0), None)
@@ -197,14 +178,9 @@ def _set_contact(builder: newton.ModelBuilder, shape: int, values: Mapping[str, 
     _values(builder, "condim")[shape] = values["condim"]
     _values(builder, "geom_priority")[shape] = values["priority"]
     if values["friction"] is not None:
-        given = values["friction"] if isinstance(values["friction"], Sequence) else (values["friction"],)
-        of_directions = (
-            builder.shape_material_mu,
-            builder.shape_material_mu_torsional,
-            builder.shape_material_mu_rolling,
-        )
-        for coefficient, of_shapes in zip(given, of_directions, strict=False):
-            of_shapes[shape] = float(coefficient)
+        friction = values["friction"] if isinstance(values["friction"], Sequence) else (values["friction"],)
+        for coefficient, direction in zip(friction, ("", "_torsional", "_rolling"), strict=False):
+            getattr(builder, f"shape_material_mu{direction}")[shape] = float(coefficient)
     if values["solref"] is not None:
         _values(builder, "solref")[shape] = wp.vec2(*values["solref"])
         _values(builder, "solref_mode")[shape] = SOLREF_AS_GIVEN
@@ -216,14 +192,14 @@ def _set_contact(builder: newton.ModelBuilder, shape: int, values: Mapping[str, 
 def _drop_stale_filters(builder: newton.ModelBuilder, before: Mapping[int, tuple[int, int] | None]) -> None:
     """Remove the pair filters that an importer derived from the file's masks, since new masks replace those."""
     parents = {frozenset(pair) for pair in zip(builder.joint_parent, builder.joint_child, strict=True)}
-    kept = []
-    for first, second in builder.shape_collision_filter_pairs:
+
+    def is_stale(first: int, second: int) -> bool:
         bodies = frozenset((builder.shape_body[first], builder.shape_body[second]))
-        old = before.get(first), before.get(second)
-        by_masks = old[0] is not None and old[1] is not None and not _touch(old[0], old[1])
-        if len(bodies) == 1 or bodies in parents or not by_masks:
-            kept.append((first, second))
-    builder.shape_collision_filter_pairs = kept
+        one, other = before.get(first), before.get(second)
+        return len(bodies) > 1 and bodies not in parents and bool(one and other and not _touch(one, other))
+
+    pairs = builder.shape_collision_filter_pairs
+    builder.shape_collision_filter_pairs = [pair for pair in pairs if not is_stale(*pair)]
 
 
 def _touch(first: tuple[int, int], second: tuple[int, int]) -> bool:

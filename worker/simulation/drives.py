@@ -73,17 +73,16 @@ class Drives:
     """
 
     def __init__(self, model: newton.Model, solver: SolverMuJoCo, world_count: int) -> None:
-        attributes: Any = vars(model)["muster"]
-        self._attributes, device = attributes, model.device
+        own: Any = vars(model)["muster"]
+        self._attributes, device = own, model.device
         data, compiled = solver.mjw_data, solver.mj_model
         shape = (world_count, compiled.nu)
-        depth = 1 + int(attributes.delay.numpy().max())
-        self.controls = wp.zeros(shape, dtype=wp.float32, device=device)
+        depth = 1 + int(own.delay.numpy().max())
         self._inputs = data.ctrl
-        self._targets = wp.zeros(shape, dtype=wp.float32, device=device)
+        self.controls, self._targets = (wp.zeros(shape, dtype=wp.float32, device=device) for _ in range(2))
         self._history = wp.zeros((*shape, depth), dtype=wp.float32, device=device)
         self._pushes = wp.zeros(shape, dtype=wp.int32, device=device)
-        explicit = attributes.explicit.numpy().reshape(shape)[0] != 0
+        explicit = own.explicit.numpy().reshape(shape)[0] != 0
         joints = np.where(explicit, compiled.actuator_trnid[:, 0], 0)
 
         def rows(columns: Any, width: int) -> wp.array[wp.uint32]:
@@ -96,10 +95,8 @@ class Drives:
             pos_indices=rows(compiled.jnt_qposadr[joints], compiled.nq),
             target_pos_indices=rows(np.arange(compiled.nu), compiled.nu),
             effort_indices=rows(np.arange(compiled.nu), compiled.nu),
-            drive=DrivePD(kp=attributes.stiffness, kd=attributes.damping),
-            clamping=[
-                ClampingDCMotor(attributes.saturation_effort, attributes.velocity_limit, attributes.effort_limit)
-            ],
+            drive=DrivePD(kp=own.stiffness, kd=own.damping),
+            clamping=[ClampingDCMotor(own.saturation_effort, own.velocity_limit, own.effort_limit)],
             control_feedforward_attr=None,
         )
         self._has_motors = bool(explicit.any())
@@ -112,20 +109,9 @@ class Drives:
 
     def launch(self) -> None:
         """Write MuJoCo's inputs for the next physics step."""
-        wp.launch(
-            _deliver,
-            dim=self.controls.shape,
-            inputs=[
-                self.controls,
-                self._attributes.delay,
-                self._attributes.explicit,
-                self._history,
-                self._pushes,
-                self._targets,
-                self._inputs,
-            ],
-            device=self.controls.device,
-        )
+        own = self._attributes
+        inputs = [self.controls, own.delay, own.explicit, self._history, self._pushes, self._targets, self._inputs]
+        wp.launch(_deliver, dim=self.controls.shape, inputs=inputs, device=self.controls.device)
         if self._has_motors:
             self._actuator.step(self._state, self._control)
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import warp as wp
+from mujoco_warp import OverflowType
 
 wp.set_module_options({"enable_backward": False})
 
@@ -30,6 +31,8 @@ PHYSICS_FAILED = wp.constant(1)
 TERMINATED = wp.constant(2)
 """Cause of an episode's end, in ``EpisodeArrays.causes``: the clock, a physics failure, or the task: the first
 termination is ``TERMINATED + 1``, the second ``TERMINATED + 2``, …"""
+CAPACITY_BITS = wp.constant(int(OverflowType.ALL & ~(OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS)))
+"""What the solver dropped for lack of room. Its limits of iterations are a chosen trade of accuracy for time, and no overflow here."""
 WATCHED = 16
 """Number of worlds, from the first, whose reward terms are kept every step for telemetry."""
 
@@ -200,7 +203,7 @@ def end_step(
 
     Args:
         episodes: The task's buffers; ``rewards`` holds this step's reward.
-        overflow: Solver overflow bits since the last call, cleared here, shape ``(worlds,)``.
+        overflow: Bits of what the solver had no room for in this step, cleared once they are counted, shape ``(worlds,)``.
         world: Row.
         terminated: Whether the task ended the episode.
         valid: Whether the physics is finite. A world whose physics, last observation or reward is not finite is reset and counted,
@@ -219,7 +222,7 @@ def end_step(
     episodes.dones[world] = done
     episodes.time_outs[world] = time_out
 
-    if overflow[world] != 0:
+    if overflow[world] & CAPACITY_BITS != 0:
         overflow[world] = 0
         wp.atomic_add(episodes.statistics, TERMS + terms + 2, wp.float64(1.0))
     if not sound:

@@ -11,13 +11,15 @@ The pose is the same in all worlds, so joint axes and body frames are constants.
 
 from __future__ import annotations
 
+from typing import Any
+
 import mujoco
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
-from worker.simulation.solver import amended_weights, is_marked
+from worker.simulation.solver import Solver, amended_weights, is_marked
+from worker.simulation.structs import filled
 from worker.simulation.worlds import Worlds
 
 wp.set_module_options({"enable_backward": False})
@@ -151,7 +153,7 @@ def _weigh(changed: wp.array[wp.bool], tree: Tree, scratch: Scratch, inertials: 
             inertia = inertia - wp.outer(force, force) / diagonal
             scratch.forces[world, dof] = force
             scratch.diagonal[world, dof] = diagonal
-        # bodies of different trees have different origins, but nothing is asked of the world's own inertia
+        # bodies of different trees have different origins, but nothing depends on the inertia of the world
         scratch.matrices[world, parent] = scratch.matrices[world, parent] + inertia
 
     scratch.matrices[world, 0] = wp.spatial_matrix()
@@ -204,47 +206,43 @@ class InverseWeights:
         self.whole = bool(model.ntendon or muscles or getattr(solver, "_kinematic_weld_eq", None) is not None)
         if self.whole:
             return
-        device, worlds_there = worlds.model.device, worlds.world_count
-        self._tree = _tree(model, solver.mjw_model.qpos0.numpy()[0], device)
-        self._tree.kinds = wp.array(solver.kinds(), dtype=wp.int32, device=device)
-        self._scratch = Scratch()
-        self._scratch.matrices = wp.zeros((worlds_there, model.nbody), dtype=wp.spatial_matrixf, device=device)
-        self._scratch.forces = wp.zeros((worlds_there, model.nv), dtype=wp.spatial_vectorf, device=device)
-        self._scratch.diagonal = wp.zeros((worlds_there, model.nv), dtype=wp.float32, device=device)
-        self._inertials = Inertials()
-        for name, field in {
-            "masses": "body_mass",
-            "centers": "body_ipos",
-            "frames": "body_iquat",
-            "moments": "body_inertia",
-            "armatures": "dof_armature",
-            "subtree_masses": "body_subtreemass",
-            "body_weights": "body_invweight0",
-            "dof_weights": "dof_invweight0",
-        }.items():
-            setattr(self._inertials, name, getattr(solver.mjw_model, field))
+        device, count = worlds.model.device, worlds.world_count
+        self._tree = _tree(model, solver, device)
+        self._scratch = filled(
+            Scratch,
+            device,
+            (count, model.nv),
+            matrices=wp.zeros((count, model.nbody), dtype=wp.spatial_matrixf, device=device),
+        )
+        self._inertials = inertials_of(solver)
 
     def update(self, changed: wp.array[wp.bool]) -> None:
         """Launches that bring the worlds with ``changed`` (shape ``(worlds,)``, bool) up to date; they can be captured."""
-        solver: SolverMuJoCo = self._worlds.solver
+        solver: Any = self._worlds.solver
         if self.whole:
             solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)
             return
-        wp.launch(
-            _weigh,
-            dim=self._worlds.world_count,
-            inputs=[changed, self._tree, self._scratch],
-            outputs=[self._inertials],
-            device=self._worlds.model.device,
-        )
+        inputs = [changed, self._tree, self._scratch]
+        device = self._worlds.model.device
+        wp.launch(_weigh, dim=self._worlds.world_count, inputs=inputs, outputs=[self._inertials], device=device)
         # Limits of joints that are given as a stiffness, as in URDF and USD files, are scaled by the weight of the joint.
         solver._update_solref_from_invweight0()
 
 
-def _tree(model: mujoco.MjModel, reference: np.ndarray, device: wp.Device) -> Tree:
-    """The constants of :class:`Tree`, from MuJoCo's own kinematics in the pose ``reference`` (its ``qpos``)."""
+def inertials_of(solver: Solver) -> Any:
+    """The :class:`Inertials` of a solver: views of its own arrays."""
+    names = ("mass", "ipos", "iquat", "inertia", "subtreemass", "invweight0")
+    bodies = [getattr(solver.mjw_model, f"body_{name}") for name in names]
+    fields = ("masses", "centers", "frames", "moments", "subtree_masses", "body_weights")
+    own = dict(zip(fields, bodies, strict=True))
+    model = solver.mjw_model
+    return filled(Inertials, None, armatures=model.dof_armature, dof_weights=model.dof_invweight0, **own)
+
+
+def _tree(model: mujoco.MjModel, solver: Solver, device: wp.Device) -> Any:
+    """The :class:`Tree` of a solver, from MuJoCo's own kinematics in the reference pose."""
     data = mujoco.MjData(model)
-    data.qpos[:] = reference
+    data.qpos[:] = solver.mjw_model.qpos0.numpy()[0]
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
     origins = data.xpos[model.body_rootid]
@@ -258,14 +256,17 @@ def _tree(model: mujoco.MjModel, reference: np.ndarray, device: wp.Device) -> Tr
         for start in starts:
             firsts[first + start : first + start + 3] = first + start
             counts[first + start : first + start + 3] = 3
-    tree = Tree()
-    tree.parents = wp.array(model.body_parentid, dtype=wp.int32, device=device)
-    tree.first_dofs = wp.array(model.body_dofadr, dtype=wp.int32, device=device)
-    tree.dof_counts = wp.array(model.body_dofnum, dtype=wp.int32, device=device)
-    tree.welded = wp.array(model.body_weldid == 0, dtype=wp.bool, device=device)
-    tree.positions = wp.array(data.xpos - origins, dtype=wp.vec3, device=device)
-    tree.rotations = wp.array(np.roll(data.xquat, -1, axis=1), dtype=wp.quat, device=device)
-    tree.axes = wp.array(np.hstack([angular, linear]), dtype=wp.spatial_vectorf, device=device)
-    tree.group_firsts = wp.array(firsts, dtype=wp.int32, device=device)
-    tree.group_counts = wp.array(counts, dtype=wp.int32, device=device)
-    return tree
+    return filled(
+        Tree,
+        device,
+        parents=model.body_parentid,
+        first_dofs=model.body_dofadr,
+        dof_counts=model.body_dofnum,
+        welded=model.body_weldid == 0,
+        kinds=solver.kinds(),
+        positions=data.xpos - origins,
+        rotations=np.roll(data.xquat, -1, axis=1),
+        axes=np.hstack([angular, linear]),
+        group_firsts=firsts,
+        group_counts=counts,
+    )

@@ -27,11 +27,11 @@ def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list
     Raises:
         ValueError: A pattern matches nothing, or there is no pattern.
     """
-    wanted = [patterns] if isinstance(patterns, str) else list(patterns)
-    if not wanted:
+    chosen = [patterns] if isinstance(patterns, str) else list(patterns)
+    if not chosen:
         raise ValueError(f"no pattern for a {what} was given; there are {', '.join(names) or 'none'}")
     found: set[int] = set()
-    for pattern in wanted:
+    for pattern in chosen:
         matching = {index for index, name in enumerate(names) if name == pattern or fnmatchcase(name, pattern)}
         if not matching:
             raise ValueError(f"no {what} matches {pattern!r}; {_what_there_is(pattern, names)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warp as wp
 
 from worker.simulation.episodes import EpisodeArrays, numbered_stream, random_stream
+from worker.simulation.inverse_weights import Inertials
 
 wp.set_module_options({"enable_backward": False})
 
@@ -97,16 +98,11 @@ class Bodies:
 
 @wp.struct
 class BodyFields:
-    """Arrays of the bodies' inertial properties: Newton's, shape ``(worlds, bodies)``, and mujoco_warp's, with the world as body 0 and in
-    its own order, shape ``(worlds, 1 + bodies)``."""
+    """Columns of the bodies in mujoco_warp's arrays, shape ``(bodies,)``, and Newton's inverses, shape ``(worlds, bodies)``."""
 
     columns: wp.array[wp.int32]
     inverse_masses: wp.array2d[wp.float32]
     inverse_inertias: wp.array2d[wp.mat33]
-    masses: wp.array2d[wp.float32]
-    centers: wp.array2d[wp.vec3]
-    moments: wp.array2d[wp.vec3]
-    frames: wp.array2d[wp.quat]
 
 
 @wp.func
@@ -243,6 +239,7 @@ def change_bodies(
     defaults: Bodies,
     values: Bodies,
     fields: BodyFields,
+    inertials: Inertials,
 ):
     """Write the inertial properties of one body of one world, from the model's own and all that was drawn for it."""
     world, index = wp.tid()
@@ -279,7 +276,7 @@ def change_bodies(
     fields.inverse_inertias[world, body] = wp.inverse(inertia)
     column = fields.columns[index]
     axes, moments = wp.eig3(inertia)
-    fields.masses[world, column] = mass
-    fields.centers[world, column] = center
-    fields.moments[world, column] = moments
-    fields.frames[world, column] = _principal_frame(axes)
+    inertials.masses[world, column] = mass
+    inertials.centers[world, column] = center
+    inertials.moments[world, column] = moments
+    inertials.frames[world, column] = _principal_frame(axes)

@@ -16,7 +16,7 @@ import warp as wp
 
 from worker.simulation.declared_randomization import DISTRIBUTIONS, MOMENTS, OPERATIONS, Randomize
 from worker.simulation.episodes import EpisodeArrays
-from worker.simulation.inverse_weights import InverseWeights
+from worker.simulation.inverse_weights import InverseWeights, inertials_of
 from worker.simulation.randomization_kernels import (
     FIRST_STREAM,
     STARTUP,
@@ -32,6 +32,7 @@ from worker.simulation.randomization_kernels import (
 from worker.simulation.randomization_targets import Change, EntryTargets, body_column, find_target
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.robot_view import RobotView
+from worker.simulation.structs import filled
 from worker.simulation.worlds import Worlds
 
 
@@ -246,32 +247,31 @@ class _BodyChanges:
 
     def __init__(self, drawn: list[_Drawn], worlds: Worlds) -> None:
         self.is_live = any(_is_live(each.entry) for each in drawn)
-        model, solver = worlds.model, worlds.solver
+        model = worlds.model
         self._device = model.device
         self._changes, bodies = _table(drawn, self._device)
         shape = (worlds.world_count, model.body_count // worlds.world_count)
-        self._values, self._defaults, self._fields = Bodies(), Bodies(), BodyFields()
         sources: dict[str, wp.array[Any]] = {
             "masses": model.body_mass,
             "centers": model.body_com,
             "inertias": model.body_inertia,
         }
-        for field, source in sources.items():
-            values = source.reshape(shape)
-            setattr(self._values, field, values)
-            own = wp.array(values.numpy()[:, bodies], dtype=source.dtype, device=self._device)
-            setattr(self._defaults, field, own)
-        self._fields.columns = wp.array(
-            [body_column(worlds, body) for body in bodies], dtype=wp.int32, device=self._device
+        values = {name: source.reshape(shape) for name, source in sources.items()}
+        self._values = filled(Bodies, self._device, **values)
+        own = {name: rows.numpy()[:, bodies] for name, rows in values.items()}
+        self._defaults = filled(Bodies, self._device, **own)
+        self._fields = filled(
+            BodyFields,
+            self._device,
+            columns=[body_column(worlds, body) for body in bodies],
+            inverse_masses=model.body_inv_mass.reshape(shape),
+            inverse_inertias=model.body_inv_inertia.reshape(shape),
         )
-        self._fields.inverse_masses = model.body_inv_mass.reshape(shape)
-        self._fields.inverse_inertias = model.body_inv_inertia.reshape(shape)
-        self._fields.masses, self._fields.centers = solver.mjw_model.body_mass, solver.mjw_model.body_ipos
-        self._fields.moments, self._fields.frames = solver.mjw_model.body_inertia, solver.mjw_model.body_iquat
+        self._inertials = inertials_of(worlds.solver)
         self._shape = (worlds.world_count, len(bodies))
 
     def launch(self, changed: wp.array[wp.bool], draws: wp.array2d[wp.float32]) -> None:
-        inputs = [changed, self._changes, draws, self._defaults, self._values, self._fields]
+        inputs = [changed, self._changes, draws, self._defaults, self._values, self._fields, self._inertials]
         wp.launch(change_bodies, dim=self._shape, inputs=inputs, device=self._device)
 
 
@@ -284,28 +284,28 @@ def _pairs(values: Iterable[tuple[float, float]], device: wp.Device | None) -> w
     return wp.array(np.array(list(values), np.float32).reshape(-1, 2), dtype=wp.vec2, device=device)
 
 
-def _table(drawn: list[_Drawn], device: wp.Device | None) -> tuple[ModelChanges, list[int]]:
-    """The changes in the layout of a kernel, and the changed columns, ascending."""
+def _table(drawn: list[_Drawn], device: wp.Device | None) -> tuple[Any, list[int]]:
+    """The changes as :class:`ModelChanges`, and the changed columns, ascending."""
     columns = sorted({each.change.column for each in drawn})
     of_column: dict[int, list[_Drawn]] = {column: [] for column in columns}
     for each in drawn:
         of_column[each.change.column].append(each)
     ordered = [each for column in columns for each in of_column[column]]
     starts = np.cumsum([0, *(len(of_column[column]) for column in columns)])
-    table = ModelChanges()
-    for name, dtype, values in (
-        ("columns", wp.int32, columns),
-        ("least", wp.float32, [max(each.change.least for each in of_column[column]) for column in columns]),
-        ("greatest", wp.float32, [min(each.change.greatest for each in of_column[column]) for column in columns]),
-        ("starts", wp.int32, starts),
-        ("operations", wp.int32, [OPERATIONS.index(each.entry.operation) for each in ordered]),
-        ("draws", wp.int32, [each.column for each in ordered]),
-        ("factors", wp.float32, [each.change.factor for each in ordered]),
-        ("kinds", wp.int32, [each.change.kind for each in ordered]),
-        ("axes", wp.int32, [each.change.body_axis for each in ordered]),
-        ("points", wp.vec3, [each.entry.at for each in ordered]),
-    ):
-        setattr(table, name, wp.array(values, dtype=dtype, device=device))
+    table = filled(
+        ModelChanges,
+        device,
+        columns=columns,
+        least=[max(each.change.least for each in of_column[column]) for column in columns],
+        greatest=[min(each.change.greatest for each in of_column[column]) for column in columns],
+        starts=starts,
+        operations=[OPERATIONS.index(each.entry.operation) for each in ordered],
+        draws=[each.column for each in ordered],
+        factors=[each.change.factor for each in ordered],
+        kinds=[each.change.kind for each in ordered],
+        axes=[each.change.body_axis for each in ordered],
+        points=[each.entry.at for each in ordered],
+    )
     return table, columns
 
 

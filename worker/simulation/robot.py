@@ -115,18 +115,8 @@ class Robot:
         Raises:
             ValueError: See :meth:`add_to`.
         """
-        source = robot_reading.ReadingOptions(
-            self.file,
-            self.fixed,
-            self.ignore,
-            self.visuals,
-            self.file_options,
-            self.accept,
-            is_placed=self.position is None and self.rotation is None,
-            has_contacts=not any(collision.only for collision in self.collisions),
-        )
         try:
-            return robot_reading.read(source)
+            return robot_reading.read(self)
         except ValueError as error:
             raise ValueError(f"{self.name}: {error}") from error
         except Exception as error:  # of a library that reads the file
@@ -140,11 +130,11 @@ class Robot:
             (own.joint_friction, view.dofs, "friction_loss"),
             (own.joint_damping, view.dofs, "viscous_damping"),
         ):
-            given = getattr(self, argument)
-            if given is None or given == {}:
+            numbers = getattr(self, argument)
+            if numbers is None or numbers == {}:
                 continue
             try:
-                resolved = resolve(view.joint_names, given, f"joint of {self.name}")
+                resolved = resolve(view.joint_names, numbers, f"joint of {self.name}")
             except ValueError as error:
                 raise ValueError(f"{self.name}: {argument}: {error}") from error
             for column, value in zip(starts, resolved, strict=True):

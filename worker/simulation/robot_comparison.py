@@ -11,42 +11,19 @@ import mujoco
 import newton
 import numpy as np
 
-from worker.simulation.robot_connections import (
-    TARGETS,
-    Ends,
-    actuator_ends,
-    equality_ends,
-    held,
-    tendon_ends,
-    tendon_numbers,
-)
-from worker.simulation.robot_contacts import differing, lost_margin, notes, stay_apart
-from worker.simulation.robot_dynamics import RELATIVE, dynamics
-from worker.simulation.robot_elements import count_of, word_of
+from worker.simulation.robot_behavior import RELATIVE, differing, dynamics, lost_margin, notes, stay_apart
+from worker.simulation.robot_elements import TARGETS, Ends, count_of, matrix, word_of
+from worker.simulation.robot_fields import CONTACT, ELSEWHERE, ENDS, SHARED, VALUES, Values
 from worker.simulation.robot_files import quiet
 from worker.simulation.robot_twins import Twins
-from worker.simulation.robot_values import (
-    effort,
-    extent,
-    freedoms,
-    from_actuators,
-    gravity,
-    has_mask,
-    inertia,
-    length,
-    matrix,
-    shown_value,
-)
+from worker.simulation.robot_values import freedoms, from_actuators, gravity, has_mask, length, shown_value
 
 ROUNDING = 1e-4
 """Up to this share of the greater one, a difference is of no consequence to a policy."""
+APART = ("type", "mocap", "contype", "conaffinity", "vertices", "middle")
+"""Values that are compared in another way, or are part of an identity alone."""
 FAR = 10.0
 """Ends of an equality are compared this much less sharply: their places add up along chains of bodies."""
-ELSEWHERE = (
-    *("mjDSBL_MULTICCD", "mjENBL_SLEEP", "mjDSBL_SENSOR", "mjDSBL_GRAVITY", "mjENBL_ENERGY", "mjENBL_FWDINV"),
-    *("mjDSBL_MIDPHASE", "mjDSBL_AUTORESET"),
-)
-"""Flags that a task's solver options set, that nothing here reads, that only report or speed up, or that are compared in another way."""
 COUNTS = {
     "coordinates": "nq",
     "degrees of freedom": "nv",
@@ -57,17 +34,6 @@ COUNTS = {
     "contact pairs": "npair",
 }
 """What is counted, and its field of ``mujoco.MjModel``."""
-TENDON = (
-    "num limited range actfrclimited actfrcrange margin stiffness stiffnesspoly frictionloss lengthspring "
-    "solref_lim solimp_lim solref_fri solimp_fri length0"
-)
-ACTUATOR = (
-    "trntype gear dyntype gaintype biastype gainprm biasprm ctrllimited forcelimited actlimited actnum actearly cranklength "
-    "delay history"
-)
-"""Compared fields of ``mujoco.MjModel``, without their prefixes."""
-SHARED = ("damping", "dampingpoly", "armature")
-"""Those of joints and tendons to which actuators add."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +99,8 @@ def compare(
     """
     with quiet():
         twins = Twins(reference, builder)
-        found = [difference for check in CHECKS for difference in check(twins)]
+        found = [*_counts(twins), *_values(twins, "body", "joint", "geom"), *_sites(twins), *_contacts(twins)]
+        found += _values(twins, "pair", "tendon", "actuator", "equality")
         found += _options(twins) if options else ()
         found = found or [RobotDifference(*each) for each in dynamics(twins, options)]
         counting = [each for each in found if not matches(each, accept)]
@@ -162,75 +129,78 @@ def _counts(twins: Twins) -> Iterator[RobotDifference]:
     for kind in ("body", "geom", "actuator"):  # what else has plugins is not read
         for index in (getattr(twins.file, f"{kind}_plugin") >= 0).nonzero()[0]:
             yield RobotDifference(twins.name(kind, index), "plugin", "missing", "there")
-
-
-def _bodies(twins: Twins) -> Iterator[RobotDifference]:
-    file, built, size = twins.file, twins.stepped, length(twins.file)
-    for body, twin in twins.bodies.items():
-        if not body:
-            continue
-        element, root = twins.name("body", body), (twins.carriers_of(twin) or [twin])[-1]
-        parent, above = int(file.body_parentid[body]), int(built.body_parentid[root])
-        if twins.bodies.get(parent) != above:
-            yield RobotDifference(element, "parent", twins.built_body(above), twins.name("body", parent))
-        yield from _fields(twins, "body", body, twin, "mass gravcomp")
-        if file.body_mass[body]:
-            yield from _unequal(element, "inertia", inertia(built, twin), inertia(file, body), 1e-15)
-            yield from _unequal(element, "centre of mass", built.body_ipos[twin], file.body_ipos[body], size)
-        yield from _unequal(element, "pos", built.body_pos[root], file.body_pos[body], size)
-        yield from _unequal(element, "orientation", matrix(built.body_quat[root]), matrix(file.body_quat[body]), 1.0)
-
-
-def _joints(twins: Twins) -> Iterator[RobotDifference]:
-    file, built = twins.file, twins.stepped
-    shares = {name: from_actuators(file, name)[0] for name in SHARED}
-    for joint, twin in twins.joints.items():
-        element = twins.name("joint", joint)
-        kind, other = (word_of(mujoco.mjtJoint, model.jnt_type[each]) for model, each in ((file, joint), (built, twin)))
-        if kind != other:
-            yield RobotDifference(element, "type", other, kind)
-            continue
-        if kind != "free":
-            yield from _unequal(element, "pos", built.jnt_pos[twin], file.jnt_pos[joint], length(file))
-        if kind in ("hinge", "slide"):
-            yield from _fields(twins, "jnt", joint, twin, "axis")
-            first, second = file.jnt_qposadr[joint], built.jnt_qposadr[twin]
-            yield from _unequal(element, "ref", built.qpos0[second], file.qpos0[first])
-            yield from _unequal(element, "springref", built.qpos_spring[second], file.qpos_spring[first])
-        yield from _fields(twins, "jnt", joint, twin, "stiffness stiffnesspoly limited actgravcomp")
-        if file.jnt_limited[joint] and built.jnt_limited[twin]:
-            yield from _fields(twins, "jnt", joint, twin, "range margin solref solimp")
-        yield from _unequal(element, "actuatorfrcrange", effort(built, twin), effort(file, joint))
-        first, second = file.jnt_dofadr[joint], built.jnt_dofadr[twin]
-        for name in (*SHARED, "frictionloss", "solref", "solimp"):
-            count = freedoms(file, joint)
-            if name not in ("solref", "solimp") or file.dof_frictionloss[first]:
-                mine, theirs = getattr(built, f"dof_{name}"), getattr(file, f"dof_{name}") + shares.get(name, 0.0)
-                word = f"{name}friction" if name.startswith("sol") else name
-                yield from _unequal(element, word, mine[second : second + count], theirs[first : first + count])
-
-
-def _geoms(twins: Twins) -> Iterator[RobotDifference]:
-    file, built = twins.file, twins.stepped
-    has_medium = bool(file.opt.density or file.opt.viscosity)
-    for geom in set(range(file.ngeom)) - set(twins.geoms):
-        if has_mask(file, geom):
+    for geom in set(range(twins.file.ngeom)) - set(twins.geoms):
+        if has_mask(twins.file, geom):
             yield RobotDifference(twins.name("geom", geom), "existence", "missing", "there")
-        if has_medium:
-            yield from _unequal(twins.name("geom", geom), "fluid", 0.0 * file.geom_fluid[geom], file.geom_fluid[geom])
-    for geom, twin in twins.geoms.items():
-        element = twins.name("geom", geom)
-        kind, other = (word_of(mujoco.mjtGeom, model.geom_type[each]) for model, each in ((file, geom), (built, twin)))
-        if kind != other:
-            yield RobotDifference(element, "type", other, kind)
-            continue
-        if has_mask(file, geom):
-            yield from _fields(twins, "geom", geom, twin, "condim friction solref solimp solmix priority gap")
-            if not lost_margin(twins, "geom", geom, twin):
-                yield from _fields(twins, "geom", geom, twin, "margin")
-        if has_medium:
-            yield from _fields(twins, "geom", geom, twin, "fluid")
-        yield from _unequal(element, "shape and place", extent(built, twin), extent(file, geom), length(file))
+        if _has_medium(twins.file):
+            fluid = twins.file.geom_fluid[geom]
+            yield from _unequal(twins.name("geom", geom), "fluid", 0.0 * fluid, fluid)
+    for pair in range(twins.file.npair):
+        if pair not in twins.contact_pairs:
+            yield RobotDifference(f"contact pair {pair}", "existence", "missing", "there")
+
+
+def _has_medium(model: Any) -> bool:
+    return bool(model.opt.density or model.opt.viscosity)
+
+
+def _values(twins: Twins, *kinds: str) -> Iterator[RobotDifference]:
+    """The values of the elements that both models have."""
+    size = length(twins.file)
+    scales = {**dict.fromkeys(("pos", "centre of mass", "shape and place"), size), "orientation": 1.0, "inertia": 1e-15}
+    scales |= dict.fromkeys(("anchor1", "anchor2", "turn"), FAR * max(1.0, size))
+    shares = {name: from_actuators(twins.file, name) for name in SHARED}
+    for kind in kinds:
+        for index, twin in twins.pairs(kind).items():
+            if kind == "body" and not index:
+                continue  # the world
+            element = f"contact pair {index}" if kind == "pair" else twins.name(kind, index)
+            theirs, mine = VALUES[kind](twins.file, index), VALUES[kind](twins.stepped, twin)
+            if mine.get("type") != theirs.get("type"):
+                yield RobotDifference(element, "type", mine["type"], theirs["type"])
+                continue
+            _settle(twins, kind, index, twin, theirs, mine)
+            for name in SHARED if kind in ("joint", "tendon") else ():
+                first, last = index, index + 1
+                if kind == "joint":
+                    first = twins.file.jnt_dofadr[index]
+                    last = first + freedoms(twins.file, index)
+                share = shares[name][kind == "tendon"][first:last]
+                theirs[name] = theirs[name] + (share if kind == "joint" else share[0])
+            for name, value in theirs.items():
+                if name in ENDS:
+                    words = _words(twins, kind, index, twin, name, value)
+                    yield from _ends(twins, element, words, twins.in_file(mine[name]), value)
+                elif name in mine and name not in APART:
+                    yield from _unequal(element, name, mine[name], value, scales.get(name, 0.0))
+
+
+def _settle(twins: Twins, kind: str, index: int, twin: int, theirs: Values, mine: Values) -> None:
+    """Let two elements have their values in the same form, without those that are noted or of no consequence."""
+    file, built = twins.file, twins.stepped
+    if kind == "body":  # with its first carrier's place
+        root = (twins.carriers_of(twin) or [twin])[-1]
+        mine |= {"pos": built.body_pos[root], "orientation": matrix(built.body_quat[root])}
+        mine["parent"] = (("body", int(built.body_parentid[root])),)
+    elif kind == "geom":
+        mine |= {name: getattr(built, f"geom_{name}")[twin] for name in CONTACT.split()}
+        if not _has_medium(file):
+            del theirs["fluid"]
+    elif kind == "pair":
+        for values in (theirs, mine):  # two zeros stand for its solref
+            if not values["solreffriction"].any():
+                values["solreffriction"] = values["solref"]
+    if "margin" in theirs and kind in ("geom", "pair") and lost_margin(twins, kind, index, twin):
+        del theirs["margin"]
+
+
+def _words(twins: Twins, kind: str, index: int, twin: int, name: str, ends: Ends) -> Sequence[str]:
+    """The attributes that name the ends of an element; none for ends that are compared in another way."""
+    if name == "drives" and twins.file.actuator_trntype[index] == twins.stepped.actuator_trntype[twin]:
+        return TARGETS.get(word_of(mujoco.mjtTrn, twins.file.actuator_trntype[index]), ())
+    if name == "between":
+        return [f"{kind}{number}" for number, (kind, _) in enumerate(ends, 1)]
+    return [f"path {number}" for number in range(len(ends))] if name == "path" else [name] if name == "parent" else []
 
 
 def _sites(twins: Twins) -> Iterator[RobotDifference]:
@@ -240,31 +210,11 @@ def _sites(twins: Twins) -> Iterator[RobotDifference]:
         if shape is None:
             yield RobotDifference(element, "existence", "missing", "there")
             continue
-        position, turn = twins.built_site(shape)
-        yield from _unequal(element, "pos", position, file.site_pos[site], length(file))
-        yield from _unequal(element, "orientation", matrix(turn), matrix(file.site_quat[site]), 1.0)
-
-
-def _pairs(twins: Twins) -> Iterator[RobotDifference]:
-    for pair in range(twins.file.npair):
-        element = f"contact pair {pair}"
-        if pair not in twins.contact_pairs:
-            yield RobotDifference(element, "existence", "missing", "there")
-            continue
-        twin = twins.contact_pairs[pair]
-        models = (twins.stepped, twin), (twins.file, pair)
-        for name in ("dim", "friction", "solref", "solimp", "margin", "gap"):
-            mine, theirs = (getattr(model, f"pair_{name}")[index] for model, index in models)
-            if name != "margin" or not lost_margin(twins, "pair", pair, twin):
-                yield from _unequal(element, name, mine, theirs)
-        mine, theirs = (_of_friction(model, index) for model, index in models)
-        yield from _unequal(element, "solreffriction", mine, theirs)
-
-
-def _of_friction(model: Any, pair: int) -> Any:
-    """A pair's ``solreffriction``, which is its ``solref`` where it is two zeros."""
-    found = model.pair_solreffriction[pair]
-    return found if found.any() else model.pair_solref[pair]
+        pose: Any = twins.builder.shape_transform[shape]
+        x, y, z, *turn = map(float, [*pose])
+        yield from _unequal(element, "pos", (x, y, z), file.site_pos[site], length(file))
+        orientation = matrix((turn[3], *turn[:3]))
+        yield from _unequal(element, "orientation", orientation, matrix(file.site_quat[site]), 1.0)
 
 
 def _contacts(twins: Twins) -> Iterator[RobotDifference]:
@@ -275,56 +225,11 @@ def _contacts(twins: Twins) -> Iterator[RobotDifference]:
             yield RobotDifference(f"geoms {names}", "contact", words[mine], words[not mine])
 
 
-def _tendons(twins: Twins) -> Iterator[RobotDifference]:
-    shares = {name: from_actuators(twins.file, name)[1] for name in SHARED}
-    for tendon, twin in twins.tendons.items():
-        yield from _fields(twins, "tendon", tendon, twin, TENDON)
-        for name, share in shares.items():
-            mine, theirs = getattr(twins.stepped, f"tendon_{name}"), getattr(twins.file, f"tendon_{name}") + share
-            yield from _unequal(twins.name("tendon", tendon), name, mine[twin], theirs[tendon])
-        there, here = tendon_ends(twins.file, tendon), twins.in_file(tendon_ends(twins.stepped, twin))
-        element, mine, theirs = (
-            twins.name("tendon", tendon),
-            *(tendon_numbers(model, index) for model, index in ((twins.stepped, twin), (twins.file, tendon))),
-        )
-        yield from _ends(twins, element, [f"path {index}" for index in range(len(there))], here, there)
-        yield from _unequal(element, "coefficients", mine, theirs)
-
-
 def _ends(twins: Twins, element: str, words: Sequence[str], here: Ends, there: Ends) -> Iterator[RobotDifference]:
     """The ends of an element that are others than in the file, by the attributes that name them."""
     for word, mine, theirs in zip(words, here, there, strict=False):
         if mine != theirs:
             yield RobotDifference(element, word, twins.shown_end(mine), twins.shown_end(theirs))
-
-
-def _actuators(twins: Twins) -> Iterator[RobotDifference]:
-    file, built = twins.file, twins.stepped
-    for actuator in range(min(file.nu, built.nu)):
-        yield from _fields(twins, "actuator", actuator, actuator, ACTUATOR)
-        for limit in ("ctrl", "force", "act"):
-            limited = f"actuator_{limit}limited"
-            if getattr(file, limited)[actuator] and getattr(built, limited)[actuator]:
-                yield from _fields(twins, "actuator", actuator, actuator, f"{limit}range")
-        if file.actuator_dyntype[actuator]:
-            yield from _fields(twins, "actuator", actuator, actuator, "dynprm lengthrange")
-        if file.actuator_trntype[actuator] == built.actuator_trntype[actuator]:
-            words = TARGETS.get(word_of(mujoco.mjtTrn, file.actuator_trntype[actuator]), ())
-            here, there = twins.in_file(actuator_ends(built, actuator)), actuator_ends(file, actuator)
-            yield from _ends(twins, twins.name("actuator", actuator), words, here, there)
-
-
-def _equalities(twins: Twins) -> Iterator[RobotDifference]:
-    file, built = twins.file, twins.stepped
-    for equality, twin in twins.equalities.items():
-        element = twins.name("equality", equality)
-        yield from _fields(twins, "eq", equality, twin, "active0 solref solimp")
-        here, there = twins.in_file(equality_ends(built, twin)), equality_ends(file, equality)
-        yield from _ends(twins, element, [f"{kind}{number}" for number, (kind, _) in enumerate(there, 1)], here, there)
-        mine = held(built, twin)
-        for name, theirs in held(file, equality).items():
-            scale = {"polycoef": 0.0, "torquescale": 0.0}.get(name, FAR * max(1.0, length(file)))
-            yield from _unequal(element, name, mine[name], theirs, scale)
 
 
 def _options(twins: Twins) -> Iterator[RobotDifference]:
@@ -340,13 +245,6 @@ def _options(twins: Twins) -> Iterator[RobotDifference]:
                 yield RobotDifference("option", f"{name} {word}", bool(mine & int(bit)), bool(theirs & int(bit)))
 
 
-def _fields(twins: Twins, kind: str, index: int, twin: int, names: str) -> Iterator[RobotDifference]:
-    element = twins.name({"jnt": "joint", "eq": "equality"}.get(kind, kind), index)
-    for name in names.split():
-        field = f"{kind}_{name}"
-        yield from _unequal(element, name, getattr(twins.stepped, field)[twin], getattr(twins.file, field)[index])
-
-
 def _unequal(element: str, field: str, built: Any, file: Any, scale: float = 0.0) -> Iterator[RobotDifference]:
     mine, theirs = (np.clip(np.asarray(value, np.float64), -newton.MAXVAL, newton.MAXVAL) for value in (built, file))
     if mine.shape != theirs.shape:
@@ -357,6 +255,3 @@ def _unequal(element: str, field: str, built: Any, file: Any, scale: float = 0.0
     greatest = max(scale, float(np.abs(theirs).max(initial=0.0)), float(np.abs(mine).max(initial=0.0)))
     if not (np.abs(mine - theirs) <= RELATIVE * greatest).all():
         yield RobotDifference(element, field, built, file)
-
-
-CHECKS = (_counts, _bodies, _joints, _geoms, _sites, _contacts, _pairs, _tendons, _actuators, _equalities)

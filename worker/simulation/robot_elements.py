@@ -1,4 +1,4 @@
-"""The elements of a compiled model: their names, and which is which in two models of one robot."""
+"""The elements of a compiled model: their names, what they connect, and which is which in two models of one robot."""
 
 from __future__ import annotations
 
@@ -7,19 +7,48 @@ from collections.abc import Iterable
 from typing import Any
 
 import mujoco
+import newton
+import numpy as np
+from newton.solvers import SolverMuJoCo
 
+CARRIER = "__carries_joint_"
+"""Part of the name of a body that only carries a joint: MuJoCo lets several joints stand between a body and its parent, each at another place.
+Newton has one joint for each body, so all but the last of them move a body without mass."""
+CARRIER_MASS = 1e-9
+"""Its mass until the model is compiled [kg]: MuJoCo's compiler demands some of every body that moves."""
+CARRIER_INERTIA = 4e-15
+"""Its moments of inertia until then [kg m^2], little more than the compiler's least."""
+Ends = tuple[tuple[str, int], ...]
+"""Kind and index of each element that another one connects; the index is -1 where there is none."""
+TARGETS = {
+    "joint": ("joint",),
+    "jointinparent": ("joint",),
+    "tendon": ("tendon",),
+    "body": ("body",),
+    "site": ("site", "refsite"),
+    "slidercrank": ("cranksite", "slidersite"),
+}
+"""Attributes of MJCF that name an actuator's ends, by its transmission."""
 Pairs = dict[int, int]
 """Index of an element in the built model, by its index in the file's."""
 
 
-def name_of(model: Any, kind: mujoco.mjtObj, index: int) -> str:
-    """An element's name, or one made of its kind and its number where the file gives none.
+def matrix(quaternion: Any) -> Any:
+    """Rotation matrix of a quaternion wxyz, shape ``(3, 3)``."""
+    found = np.zeros(9)
+    mujoco.mju_quat2Mat(found, np.asarray(quaternion, np.float64))
+    return found.reshape(3, 3)
 
-    Args:
-        model: A compiled model, ``mujoco.MjModel``.
-        kind: Kind of the element.
-        index: Its index among those of its kind.
-    """
+
+def quaternion(matrix: Any) -> Any:
+    """Quaternion wxyz of a rotation matrix, shape ``(4,)``."""
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix, np.float64).ravel())
+    return found
+
+
+def name_of(model: Any, kind: mujoco.mjtObj, index: int) -> str:
+    """Name of an element of a ``mujoco.MjModel``, or one made of its kind and its number where the file gives none."""
     name: str | None = mujoco.mj_id2name(model, kind, index)
     return name or f"{mujoco.mju_type2Str(kind)}_{index}"
 
@@ -103,3 +132,107 @@ def paired(there: dict[int, str], here: dict[int, str]) -> Pairs:
 def some(names: list[str]) -> str:
     """The first names, for a sentence."""
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def actuator_ends(model: Any, actuator: int) -> Ends:
+    """What an actuator drives, in the order of :data:`TARGETS`; empty for a transmission that is not among them."""
+    words = TARGETS.get(word_of(mujoco.mjtTrn, model.actuator_trntype[actuator]), ())
+    indices = model.actuator_trnid[actuator]
+    return tuple(("site" if "site" in word else word, int(index)) for word, index in zip(words, indices, strict=False))
+
+
+def equality_ends(model: Any, equality: int) -> Ends:
+    """The bodies of a connect or a weld, or the joints or tendons of another equality."""
+    kind = word_of(mujoco.mjtEq, model.eq_type[equality])
+    indices = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
+    if kind in ("connect", "weld"):
+        if _of_sites(model, equality):
+            indices = [int(body) for body in model.site_bodyid[indices]]
+        kind = "body"
+    return tuple((kind, index) for index in indices)
+
+
+def tendon_ends(model: Any, tendon: int) -> Ends:
+    """The elements of a tendon's path, in their order; of a wrapped geom, its side site too."""
+    found = []
+    for wrap in _wraps(model, tendon):
+        kind, index = word_of(mujoco.mjtWrap, model.wrap_type[wrap]), int(model.wrap_objid[wrap])
+        found.append((kind, index) if kind in ("joint", "site", "pulley") else ("geom", index))
+        if kind in ("sphere", "cylinder"):
+            found.append(("site", int(model.wrap_prm[wrap])))
+    return tuple(found)
+
+
+def pair_ends(model: Any, pair: int) -> Ends:
+    """The geoms of a contact pair."""
+    return ("geom", int(model.pair_geom1[pair])), ("geom", int(model.pair_geom2[pair]))
+
+
+def tendon_numbers(model: Any, tendon: int) -> Any:
+    """Coefficients of a tendon's joints and divisors of its pulleys, in the order of its path."""
+    numbered = (int(mujoco.mjtWrap.mjWRAP_JOINT), int(mujoco.mjtWrap.mjWRAP_PULLEY))
+    return np.array([model.wrap_prm[wrap] for wrap in _wraps(model, tendon) if model.wrap_type[wrap] in numbered])
+
+
+def effective_geoms(model: Any) -> list[int]:
+    """The geoms that do anything: they touch by their masks or in a contact pair, or a tendon wraps them."""
+    kinds = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
+    named = (model.pair_geom1, model.pair_geom2, model.wrap_objid[np.isin(model.wrap_type, kinds)])
+    masked = (model.geom_contype | model.geom_conaffinity).nonzero()[0]
+    return sorted({int(geom) for group in (*named, masked) for geom in group})
+
+
+def held(model: Any, equality: int) -> dict[str, Any]:
+    """What an equality holds, in forms that do not depend on whether it names bodies or sites.
+
+    Returns:
+        By name: ``anchor1`` and ``anchor2``, the points that are held together, each in its body's frame [m]; for a weld also ``turn``,
+        the rotation matrix of the second body in the first one's frame, and ``torquescale``; for other equalities ``polycoef``. Source:
+        MuJoCo's ``mj_instantiateConnect`` and ``mj_instantiateWeld``.
+    """
+    kind, data = word_of(mujoco.mjtEq, model.eq_type[equality]), model.eq_data[equality]
+    if kind not in ("connect", "weld"):
+        return {"polycoef": data[:5]}
+    if _of_sites(model, equality):
+        sites = [int(model.eq_obj1id[equality]), int(model.eq_obj2id[equality])]
+        anchors = [model.site_pos[site] for site in sites]
+        first, second = (matrix(model.site_quat[site]) for site in sites)
+        turn = first @ second.T
+    else:
+        anchors = [data[:3], data[3:6]] if kind == "connect" else [data[3:6], data[:3]]
+        turn = matrix(data[6:10])
+    found = {"anchor1": anchors[0], "anchor2": anchors[1]}
+    return found if kind == "connect" else {**found, "turn": turn, "torquescale": data[10]}
+
+
+def _of_sites(model: Any, equality: int) -> bool:
+    return bool(model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE))
+
+
+def _wraps(model: Any, tendon: int) -> range:
+    return range(model.tendon_adr[tendon], model.tendon_adr[tendon] + model.tendon_num[tendon])
+
+
+def is_carrier(label: str) -> bool:
+    """Whether the body with this label only carries a joint."""
+    return CARRIER in short(label)
+
+
+def keep_inertias(builder: newton.ModelBuilder) -> None:
+    """Let Newton leave moments of inertia as they are: MuJoCo's compiler judges them."""
+    builder.balance_inertia = False
+    builder.inertia_relative_tolerance = builder.inertia_correction = 0.0
+    builder.inertia_absolute_tolerance = 1e-30  # Newton wants more than 0
+
+
+def unload(model: newton.Model, solver: SolverMuJoCo) -> None:
+    """Take the mass from the carriers of a model, after its solver was built."""
+    bodies = [index for index, label in enumerate(model.body_label) if is_carrier(label)]
+    if not bodies:
+        return
+    arrays: tuple[Any, ...] = (model.body_mass, model.body_inv_mass, model.body_inertia, model.body_inv_inertia)
+    for array in arrays:
+        values = array.numpy()
+        values[bodies] = 0.0
+        array.assign(values)
+    solver.notify_model_changed(newton.ModelFlags.BODY_INERTIAL_PROPERTIES)

@@ -45,6 +45,11 @@ class RobotFile:
     spec: Any = None
 
 
+def is_xml(source: str) -> bool:
+    """Whether a source is the text of a file, and not its path."""
+    return source.lstrip().startswith("<")
+
+
 def read(file: str | Path) -> RobotFile:
     """Find and inspect a robot's file.
 
@@ -59,17 +64,16 @@ def read(file: str | Path) -> RobotFile:
     text = str(file)
     if not text.strip():
         raise ValueError("a robot needs a file: a path, package:NAME/path, newton:NAME, or the text of one")
-    if text.lstrip().startswith("<"):
-        source, kind = text, _kind_of_xml(text, "the robot's XML")
+    if is_xml(text):
+        source, shown, kind = text, "the robot's XML", _kind_of_xml(text, "the robot's XML")
     else:
-        path = _path(text)
-        source = str(path)
-        if path.suffix.lower() not in FORMATS:
+        path, shown = _path(text), text
+        source, ending = str(path), path.suffix.lower()
+        if ending not in FORMATS:
             raise ValueError(
                 f"{text}: a robot's file ends in {', '.join(FORMATS)}, not in {path.suffix or 'nothing'!r}"
             )
-        kind = FORMATS[path.suffix.lower()] or _kind_of_xml(_text_of(path, text), text)
-    shown = "the robot's XML" if source == text and source.lstrip().startswith("<") else text
+        kind = FORMATS[ending] or _kind_of_xml(_text_of(path, text), text)
     if kind == "mjcf":
         spec = parse_mjcf(source, shown)
         return RobotFile(source, kind, _hinges(spec), spec)
@@ -97,24 +101,21 @@ def _text_of(path: Path, shown: str) -> str:
 
 def _path(file: str) -> Path:
     scheme, _, rest = file.partition(":")
-    if scheme == "package":
-        return _in_package(file, rest)
     if scheme == "newton":
         return _in_folder(file, Path(newton.examples.get_asset_directory()), rest, "Newton's assets")
+    if scheme == "package":
+        package, _, inside = rest.partition("/")
+        found = importlib.util.find_spec(package) if package.isidentifier() else None
+        if found is None or not found.submodule_search_locations:
+            known = [name for name in metadata.packages_distributions() if not name.startswith("_")]
+            near = nearest(package, known, "install it in the workers' environment", cutoff=0.7)
+            raise ValueError(f"{file}: there is no Python package {package!r}; {near}")
+        folder = Path(next(iter(found.submodule_search_locations)))
+        return _in_folder(file, folder, inside, f"the package {package}")
     path = Path(file).expanduser()
     if not path.parent.is_dir():
         raise ValueError(f"{file}: there is no folder {path.parent}; relative paths begin at {Path.cwd()}")
     return _in_folder(file, path.parent, path.name, str(path.parent))
-
-
-def _in_package(file: str, rest: str) -> Path:
-    package, _, inside = rest.partition("/")
-    found = importlib.util.find_spec(package) if package.isidentifier() else None
-    if found is None or not found.submodule_search_locations:
-        known = [name for name in metadata.packages_distributions() if not name.startswith("_")]
-        near = nearest(package, known, "install it in the workers' environment", cutoff=0.7)
-        raise ValueError(f"{file}: there is no Python package {package!r}; {near}")
-    return _in_folder(file, Path(next(iter(found.submodule_search_locations))), inside, f"the package {package}")
 
 
 def _in_folder(file: str, folder: Path, name: str, where: str) -> Path:
@@ -168,7 +169,7 @@ def parse_mjcf(source: str, shown: str) -> Any:
     Raises:
         ValueError: MuJoCo can't parse it.
     """
-    is_text = source.lstrip().startswith("<")
+    is_text = is_xml(source)
     try:
         with quiet() as warned:
             spec = (mujoco.MjSpec.from_string if is_text else _spec_of_file)(source)
@@ -195,15 +196,14 @@ def _not_a_number(source: str) -> str:
         parents = {child: parent for parent in root.iter() for child in parent}
         for element in root.iter():
             for name, value in element.attrib.items():
-                if "nan" in value.lower().split():
-                    owner = element
-                    while not owner.get("name") and owner in parents:
-                        owner = parents[owner]
-                    is_within = owner is not element and owner.get("name")
-                    within = f" in {owner.tag} {owner.get('name')}" if is_within else ""
-                    return (
-                        f"{name}={value!r} of <{element.tag} name={element.get('name', '')!r}>{within} is not a number"
-                    )
+                if "nan" not in value.lower().split():
+                    continue
+                owner = element
+                while not owner.get("name") and owner in parents:
+                    owner = parents[owner]
+                is_within = owner is not element and owner.get("name")
+                within = f" in {owner.tag} {owner.get('name')}" if is_within else ""
+                return f"{name}={value!r} of <{element.tag} name={element.get('name', '')!r}>{within} is not a number"
     return "a value of a model that it attaches is not a number"
 
 
@@ -212,7 +212,7 @@ def mjcf_roots(source: str) -> Iterator[tuple[ElementTree.Element, Path]]:
 
     MuJoCo looks for an included file in the folder of the first one, then in that of the file which includes it.
     """
-    is_text = source.lstrip().startswith("<")
+    is_text = is_xml(source)
     first = Path() if is_text else Path(source).parent
     yield from _with_included(source if is_text else Path(source), first, first)
 
@@ -244,18 +244,14 @@ def named_options(file: RobotFile) -> set[str]:
 
 
 def asset_folders(source: str, kind: str) -> list[tuple[Path, str]]:
-    """Where an MJCF file, or the text of one, and the models that it attaches look for their assets.
-
-    Args:
-        source: Path or text of the file.
-        kind: ``"meshdir"`` or ``"texturedir"``.
+    """Where an MJCF file, or the text of one, and the models that it attaches look for assets of ``"meshdir"`` or ``"texturedir"``.
 
     Returns:
         Of each file: its folder, and the assets' folder inside of that as the file says it, the main file's first.
     """
     words: dict[str, str] = {}
     attached = []
-    main = Path() if source.lstrip().startswith("<") else Path(source).parent
+    main = Path() if is_xml(source) else Path(source).parent
     for root, _ in mjcf_roots(source):
         for compiler in root.iter("compiler"):
             words |= compiler.attrib
@@ -265,14 +261,7 @@ def asset_folders(source: str, kind: str) -> list[tuple[Path, str]]:
 
 
 def missing_asset(spec: Any, source: str, name: str, shown: str) -> ValueError:
-    """The error of a mesh or height field that MuJoCo can't open.
-
-    Args:
-        spec: The parsed file, ``mujoco.MjSpec``.
-        source: Path or text of the file.
-        name: The asset as MuJoCo says it, with the folder of the assets.
-        shown: The file's name, for errors.
-    """
+    """The error of a mesh or height field that MuJoCo can't open, by its ``name`` in MuJoCo's message, with the folder of the assets."""
     places = [(folder, os.path.normpath(inside)) for folder, inside in asset_folders(source, "meshdir")]
     without = [(folder, inside) for folder, inside in places if not (folder / name).is_file()]
     within = [each for each in without if Path(name).is_relative_to(each[1])]
@@ -302,24 +291,19 @@ def quiet() -> Iterator[list[str]]:
 
 def urdf_root(source: str, shown: str) -> ElementTree.Element:
     """The ``<robot>`` of a URDF file or text. Raises ValueError where it has macros of xacro, which are not expanded."""
-    root = _root(source if source.lstrip().startswith("<") else _text_of(Path(source), shown), shown)
+    root = _root(source if is_xml(source) else _text_of(Path(source), shown), shown)
     if any("xacro" in str(element.tag).rpartition("}")[0] for element in root.iter()):
         raise ValueError(f"{shown}: {XACRO}")
     return root
 
 
 def urdf_mesh(source: str, name: str, shown: str) -> Path:
-    """Find a mesh that a URDF file names.
-
-    Args:
-        source: Path or text of the file.
-        name: As in the file: relative to it, ``file://…`` or ``package://NAME/…``.
-        shown: The file's name, for errors.
+    """Find a mesh that a URDF file names: relative to the file, ``file://…`` or ``package://NAME/…``.
 
     Raises:
         ValueError: It is missing, or it can't be found.
     """
-    if source.lstrip().startswith("<"):
+    if is_xml(source):
         raise ValueError(
             f"{shown}: its mesh {name} can only be found relative to a URDF file; give the path of that file"
         )

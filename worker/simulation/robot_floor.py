@@ -24,15 +24,7 @@ COEFFICIENTS = {1: 0, 3: 1, 4: 2, 6: 3}
 
 
 def compiled(spec: Any, is_ignored: Callable[[str], bool]) -> Any:
-    """The floors of a file that will be left out, compiled alone.
-
-    Args:
-        spec: The parsed file, ``mujoco.MjSpec``, which stays as it is.
-        is_ignored: Whether a geom of a name will be left out.
-
-    Returns:
-        ``mujoco.MjModel`` of the floors; None: there are none that touch anything.
-    """
+    """The floors of a parsed file that will be left out, compiled alone as ``mujoco.MjModel``; None: there are none that touch anything."""
     if not _floors(spec.worldbody, is_ignored):
         return None
     alone = spec.copy()
@@ -65,13 +57,9 @@ def _floors(body: Any, is_ignored: Callable[[str], bool]) -> list[Any]:
 
 
 def notes(model: Any, floors: Any, *, is_placed: bool, has_contacts: bool) -> Iterator[str]:
-    """What Muster's ground has otherwise than the floors that were left out, one sentence each.
+    """What Muster's ground has otherwise than the floors of :func:`compiled`, one sentence each.
 
-    Args:
-        model: The robot's compiled model, ``mujoco.MjModel``.
-        floors: See :func:`compiled`.
-        is_placed: Whether the robot begins where its file puts it, so that the floor's place matters.
-        has_contacts: Whether its geoms touch as the file says, so that the floor's contacts matter.
+    Their place matters where the robot begins where its file puts it, and their contacts where its geoms touch as the file says.
     """
     for floor in range(floors.ngeom if floors else 0):
         name = f"the file's {name_of(floors, mujoco.mjtObj.mjOBJ_GEOM, floor)}"

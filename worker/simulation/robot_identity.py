@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import mujoco
@@ -13,28 +13,16 @@ import newton
 import numpy as np
 
 from shared_store.contract.policy import RobotModel
-from worker.simulation.robot_comparison import ACTUATOR, ELSEWHERE, SHARED, TENDON, RobotDifference
-from worker.simulation.robot_connections import (
-    Ends,
-    actuator_ends,
-    equality_ends,
-    held,
-    pair_ends,
-    tendon_ends,
-    tendon_numbers,
-)
-from worker.simulation.robot_elements import count_of, kind_of, name_of, short, word_of
-from worker.simulation.robot_values import effort, extent, freedoms, gravity, has_mask, inertia, matrix
+from worker.simulation.robot_comparison import RobotDifference
+from worker.simulation.robot_elements import Ends, count_of, kind_of, name_of, short, word_of
+from worker.simulation.robot_fields import ELSEWHERE, ENDS, VALUES, Values
+from worker.simulation.robot_values import gravity
 
-Values = dict[str, Any]
-"""Values of one element by their names: numbers, arrays or words."""
 _IMPORTED = (
     "body_mass body_com body_inertia joint_type joint_parent joint_child joint_X_p joint_X_c joint_axis joint_limit_lower "
     "joint_limit_upper joint_armature joint_friction joint_damping shape_type shape_body shape_scale shape_transform"
 )
 """Arrays of Newton's builder that say what a robot is, where it holds another one than the file, or MuJoCo doesn't compile the file."""
-CONTACT = "condim friction solref solimp solmix priority margin gap contype conaffinity"
-PAIR = "dim friction solref solimp margin gap solreffriction"
 OPTION = (
     "wind density viscosity impratio cone disableactuator solver iterations ls_iterations tolerance ls_tolerance "
     "disableflags enableflags"
@@ -84,101 +72,20 @@ def identity(
 
 
 def _elements(model: Any) -> dict[str, Values]:
-    """What is compared of each element of a compiled model, in the model's order."""
-    found = {
-        f"{kind} {name_of(model, kind_of(kind), index)}": values(model, index)
-        for kind, values in _VALUES.items()
-        for index in range(kind == "body", count_of(model, kind))  # a body 0 is the world
-    }
-    found |= {f"contact pair {pair}": _pair(model, pair) for pair in range(model.npair)}
+    """The values of each element of a compiled model, in the model's order; what it connects, by names."""
+    found = {}
+    for kind, values in VALUES.items():
+        for index in range(kind == "body", count_of(model, kind)):  # a body 0 is the world
+            name = f"contact pair {index}" if kind == "pair" else f"{kind} {name_of(model, kind_of(kind), index)}"
+            own = values(model, index)
+            found[name] = {key: _names(model, value) if key in ENDS else value for key, value in own.items()}
     excluded = ([int(signature) >> 16, int(signature) & 0xFFFF] for signature in model.exclude_signature)
     return found | {"model": {"exclude": _names(model, tuple(("body", body) for pair in excluded for body in pair))}}
-
-
-def _fields(model: Any, kind: str, index: int, names: str) -> Values:
-    return {name: getattr(model, f"{kind}_{name}")[index] for name in names.split()}
 
 
 def _names(model: Any, ends: Ends) -> str:
     """The names of what an element connects."""
     return ", ".join(name_of(model, kind_of(kind), index) for kind, index in ends if index >= 0)
-
-
-def _place(model: Any, kind: str, index: int) -> Values:
-    pos, quat = (getattr(model, f"{kind}_{name}")[index] for name in ("pos", "quat"))
-    return {"pos": pos, "orientation": matrix(quat)}
-
-
-def _body(model: Any, body: int) -> Values:
-    values = {"parent": _names(model, (("body", int(model.body_parentid[body])),))} | _place(model, "body", body)
-    values |= _fields(model, "body", body, "mass gravcomp") | {"mocap": int(model.body_mocapid[body] >= 0)}
-    if model.body_mass[body]:
-        values |= {"inertia": inertia(model, body), "centre of mass": model.body_ipos[body]}
-    return values
-
-
-def _joint(model: Any, joint: int) -> Values:
-    kind = word_of(mujoco.mjtJoint, model.jnt_type[joint])
-    body: Values = {"type": kind, "body": _names(model, (("body", int(model.jnt_bodyid[joint])),))}
-    values = body | _fields(model, "jnt", joint, "stiffness stiffnesspoly limited actgravcomp")
-    if kind != "free":
-        values["pos"] = model.jnt_pos[joint]
-    if kind in ("hinge", "slide"):
-        coordinate = model.jnt_qposadr[joint]
-        springs = {"ref": model.qpos0[coordinate], "springref": model.qpos_spring[coordinate]}
-        values |= {"axis": model.jnt_axis[joint], **springs}
-    if model.jnt_limited[joint]:
-        values |= _fields(model, "jnt", joint, "range margin solref solimp")
-    values["actuatorfrcrange"] = effort(model, joint)
-    first, count = model.jnt_dofadr[joint], freedoms(model, joint)
-    for name in (*SHARED, "frictionloss", "solref", "solimp"):
-        word = {"solref": "solreffriction", "solimp": "solimpfriction"}.get(name, name)
-        if word == name or model.dof_frictionloss[first]:
-            values[word] = getattr(model, f"dof_{name}")[first : first + count]
-    return values
-
-
-def _geom(model: Any, geom: int) -> Values:
-    kind = word_of(mujoco.mjtGeom, model.geom_type[geom])
-    values = {"type": kind, "body": _names(model, (("body", int(model.geom_bodyid[geom])),))}
-    values |= {"shape and place": extent(model, geom), "fluid": model.geom_fluid[geom]}
-    if kind == "mesh":
-        mesh = model.geom_dataid[geom]
-        first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
-        mean = model.mesh_vert[first : first + count].astype(np.float64).mean(0)
-        values |= {"vertices": count, "middle": model.geom_pos[geom] + matrix(model.geom_quat[geom]) @ mean}
-    return values | (_fields(model, "geom", geom, CONTACT) if has_mask(model, geom) else {})
-
-
-def _site(model: Any, site: int) -> Values:
-    return {"body": _names(model, (("body", int(model.site_bodyid[site])),))} | _place(model, "site", site)
-
-
-def _pair(model: Any, pair: int) -> Values:
-    return {"geoms": _names(model, pair_ends(model, pair))} | _fields(model, "pair", pair, PAIR)
-
-
-def _tendon(model: Any, tendon: int) -> Values:
-    path = {"path": _names(model, tendon_ends(model, tendon)), "coefficients": tendon_numbers(model, tendon)}
-    return path | _fields(model, "tendon", tendon, " ".join((TENDON, *SHARED)))
-
-
-def _actuator(model: Any, actuator: int) -> Values:
-    limits = " ".join(f"{word}range" for word in ("ctrl", "force", "act") if _is_limited(model, word, actuator))
-    values = {"drives": _names(model, actuator_ends(model, actuator))}
-    values |= _fields(model, "actuator", actuator, " ".join((ACTUATOR, *SHARED, limits)))
-    values |= {name: np.trim_zeros(values[name], "b") for name in ("gear", "gainprm", "biasprm")}
-    return values | (_fields(model, "actuator", actuator, "dynprm lengthrange") if values["dyntype"] else {})
-
-
-def _is_limited(model: Any, word: str, actuator: int) -> bool:
-    return bool(getattr(model, f"actuator_{word}limited")[actuator])
-
-
-def _equality(model: Any, equality: int) -> Values:
-    kind = {"type": word_of(mujoco.mjtEq, model.eq_type[equality])}
-    ends = {"between": _names(model, equality_ends(model, equality))}
-    return kind | ends | _fields(model, "eq", equality, "active0 solref solimp") | held(model, equality)
 
 
 def _options(builder: newton.ModelBuilder, model: Any) -> Values:
@@ -190,17 +97,6 @@ def _options(builder: newton.ModelBuilder, model: Any) -> Values:
         ]
         values[name] = " ".join(word_of(kind, bit) for bit in flags if int(values[name]) & int(bit))
     return values | {"integrator": (builder.custom_attributes["mujoco:integrator"].values or [None])[0]}
-
-
-_VALUES: dict[str, Callable[[Any, int], Values]] = {
-    "body": _body,
-    "joint": _joint,
-    "geom": _geom,
-    "site": _site,
-    "tendon": _tendon,
-    "actuator": _actuator,
-    "equality": _equality,
-}
 
 
 def _flat(values: Any) -> Any:

@@ -13,30 +13,58 @@ from xml.etree import ElementTree
 import mujoco
 import numpy as np
 
-from worker.simulation import carriers
-from worker.simulation.robot_connections import TARGETS, actuator_ends, effective_geoms, equality_ends, held
-from worker.simulation.robot_elements import Words, unique_names
-from worker.simulation.robot_values import quaternion
+from worker.simulation.robot_elements import (
+    CARRIER,
+    CARRIER_INERTIA,
+    CARRIER_MASS,
+    TARGETS,
+    Words,
+    actuator_ends,
+    effective_geoms,
+    equality_ends,
+    held,
+    quaternion,
+    unique_names,
+)
 
 Element = ElementTree.Element
-
-
-_GEOM_TYPES = Words(mujoco.mjtGeom, "plane hfield sphere capsule ellipsoid cylinder box mesh")
-_JOINT_TYPES = Words(mujoco.mjtJoint, "free ball slide hinge")
-_WRAP_TYPES = Words(mujoco.mjtWrap, "joint pulley site sphere cylinder")
-_EQUALITY_TYPES = Words(mujoco.mjtEq, "connect weld joint tendon")
-_TRANSMISSIONS = Words(mujoco.mjtTrn, "joint jointinparent slidercrank tendon site body")
-_DYNAMICS = Words(mujoco.mjtDyn, "none integrator filter filterexact muscle user")
-_INTEGRATORS = Words(mujoco.mjtIntegrator, "Euler RK4 implicit implicitfast")
-_CONES = Words(mujoco.mjtCone, "pyramidal elliptic")
-_GAINS = Words(mujoco.mjtGain, "fixed affine muscle user")
-_BIASES = Words(mujoco.mjtBias, "none affine muscle user")
+_WORDS = {
+    "geom": Words(mujoco.mjtGeom, "plane hfield sphere capsule ellipsoid cylinder box mesh"),
+    "joint": Words(mujoco.mjtJoint, "free ball slide hinge"),
+    "wrap": Words(mujoco.mjtWrap, "joint pulley site sphere cylinder"),
+    "equality": Words(mujoco.mjtEq, "connect weld joint tendon"),
+    "trntype": Words(mujoco.mjtTrn, "joint jointinparent slidercrank tendon site body"),
+    "dyntype": Words(mujoco.mjtDyn, "none integrator filter filterexact muscle user"),
+    "gaintype": Words(mujoco.mjtGain, "fixed affine muscle user"),
+    "biastype": Words(mujoco.mjtBias, "none affine muscle user"),
+    "integrator": Words(mujoco.mjtIntegrator, "Euler RK4 implicit implicitfast"),
+    "cone": Words(mujoco.mjtCone, "pyramidal elliptic"),
+}
+_OPTIONS = "wind density viscosity impratio tolerance ls_tolerance iterations ls_iterations"
+_BODY = "pos=ipos quat=iquat mass diaginertia=inertia"
+_JOINT = (
+    "pos limited range margin stiffness solreflimit=solref solimplimit=solimp actuatorgravcomp=actgravcomp "
+    "actuatorfrclimited=actfrclimited"
+)
+_DOF = "damping armature frictionloss solreffriction=solref solimpfriction=solimp"
+_GEOM = "pos quat contype conaffinity condim group priority friction solmix solref solimp margin gap"
+_PAIR = "condim=dim friction solref solreffriction solimp margin gap"
+_TENDON = (
+    "limited range actuatorfrclimited=actfrclimited actuatorfrcrange=actfrcrange margin stiffness damping armature frictionloss "
+    "springlength=lengthspring solreflimit=solref_lim solimplimit=solimp_lim solreffriction=solref_fri solimpfriction=solimp_fri"
+)
+_ACTUATOR = (
+    "gear dynprm gainprm biasprm lengthrange actearly ctrllimited ctrlrange forcelimited forcerange actlimited actrange"
+)
+"""Attributes of MJCF, and the fields of ``mujoco.MjModel`` without their prefixes where those have other names."""
+_FLAGS = ("limited", "gravcomp", "actearly", "active")
+"""Ends of the names of attributes that are true or false."""
 
 
 def write(model: Any, *, named: Collection[str] = (), visuals: bool = True) -> str:
     """Write a compiled model as MJCF.
 
-    Of several joints of a body all but the last move carriers (:mod:`worker.simulation.carriers`), so that each keeps its own place,
+    Of several joints of a body all but the last move carriers (:data:`worker.simulation.robot_elements.CARRIER`), so that each keeps its own place,
     its order and its part in a tendon.
 
     Args:
@@ -67,9 +95,15 @@ class _Writer:
             self.names[kind] = unique_names(self.model, kind)
         return self.names[kind][int(index)]
 
-    def word(self, words: Words, values: Any, kind: str, index: int) -> str:
+    def word(self, words: str, values: Any, kind: str, index: int) -> str:
         """The word for the value of an element of some kind."""
-        return words.of(values[index], f"{kind} {self.name(kind, index)}")
+        return _WORDS[words].of(values[index], f"{kind} {self.name(kind, index)}")
+
+    def values(self, prefix: str, index: int, names: str) -> dict[str, Any]:
+        """Attributes of an element, as of :data:`_GEOM`."""
+        pairs = [(name, field or name) for name, _, field in (each.partition("=") for each in names.split())]
+        found = {name: getattr(self.model, f"{prefix}_{field}")[index] for name, field in pairs}
+        return {name: bool(value) if name.endswith(_FLAGS) else value for name, value in found.items()}
 
     def write(self) -> str:
         root = Element("mujoco", model="robot")
@@ -100,23 +134,13 @@ class _Writer:
 
     def _write_options(self, root: Element) -> None:
         options = self.model.opt
-        chosen = {"integrator": _INTEGRATORS.of(options.integrator, "option")} if "integrator" in self.named else {}
+        values = {name: getattr(options, name) for name in _OPTIONS.split()}
+        values["cone"] = _WORDS["cone"].of(options.cone, "option")
+        if "integrator" in self.named:
+            values["integrator"] = _WORDS["integrator"].of(options.integrator, "option")
         if options.solver == int(mujoco.mjtSolver.mjSOL_CG):
-            chosen["solver"] = "CG"
-        element = _add(
-            root,
-            "option",
-            wind=options.wind,
-            density=options.density,
-            viscosity=options.viscosity,
-            impratio=options.impratio,
-            tolerance=options.tolerance,
-            ls_tolerance=options.ls_tolerance,
-            iterations=options.iterations,
-            ls_iterations=options.ls_iterations,
-            cone=_CONES.of(options.cone, "option"),
-            **chosen,
-        )
+            values["solver"] = "CG"
+        element = _add(root, "option", **values)
         flags = {}
         for kind, bits, off in (
             (mujoco.mjtDisableBit, options.disableflags, "disable"),
@@ -135,27 +159,16 @@ class _Writer:
         model = self.model
         first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
         face, faces = model.mesh_faceadr[mesh], model.mesh_facenum[mesh]
-        _add(
-            asset,
-            "mesh",
-            name=self.name("mesh", mesh),
-            vertex=model.mesh_vert[first : first + count].ravel(),
-            face=model.mesh_face[face : face + faces].ravel(),
-        )
+        vertex, triangles = model.mesh_vert[first : first + count], model.mesh_face[face : face + faces]
+        _add(asset, "mesh", name=self.name("mesh", mesh), vertex=vertex.ravel(), face=triangles.ravel())
 
     def _write_hfield(self, asset: Element, hfield: int) -> None:
         model = self.model
         rows, columns, first = model.hfield_nrow[hfield], model.hfield_ncol[hfield], model.hfield_adr[hfield]
         data = model.hfield_data[first : first + rows * columns].reshape(rows, columns)
-        _add(
-            asset,
-            "hfield",
-            name=self.name("hfield", hfield),
-            size=model.hfield_size[hfield],
-            nrow=rows,
-            ncol=columns,
-            elevation=data[::-1].ravel(),  # the text begins with the last row
-        )
+        size = {"size": model.hfield_size[hfield], "nrow": rows, "ncol": columns}
+        elevation = data[::-1].ravel()  # the text begins with the last row
+        _add(asset, "hfield", name=self.name("hfield", hfield), elevation=elevation, **size)
 
     def _write_body(self, body: int) -> None:
         model = self.model
@@ -164,112 +177,57 @@ class _Writer:
         place: dict[str, Any] = {"pos": model.body_pos[body], "quat": model.body_quat[body]}
         joints = range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body])
         for index, joint in enumerate(joints[:-1]):
-            parent = _add(parent, "body", name=f"{name}{carriers.MARK}{index}", **place)
-            _add(parent, "inertial", pos=(0, 0, 0), mass=carriers.MASS, diaginertia=(carriers.INERTIA,) * 3)
+            parent = _add(parent, "body", name=f"{name}{CARRIER}{index}", **place)
+            _add(parent, "inertial", pos=(0, 0, 0), mass=CARRIER_MASS, diaginertia=(CARRIER_INERTIA,) * 3)
             self._write_joint(parent, joint)
             place = {}
         if model.body_mocapid[body] >= 0:
             place["mocap"] = "true"
         element = self.bodies[body] = _add(parent, "body", name=name, gravcomp=model.body_gravcomp[body], **place)
         if model.body_mass[body] > 0:
-            _add(
-                element,
-                "inertial",
-                pos=model.body_ipos[body],
-                quat=model.body_iquat[body],
-                mass=model.body_mass[body],
-                diaginertia=model.body_inertia[body],
-            )
+            _add(element, "inertial", **self.values("body", body, _BODY))
         for joint in joints[-1:]:
             self._write_joint(element, joint)
 
     def _write_joint(self, element: Element, joint: int) -> None:
         model = self.model
-        name, kind = self.name("joint", joint), self.word(_JOINT_TYPES, model.jnt_type, "joint", joint)
+        name, kind = self.name("joint", joint), self.word("joint", model.jnt_type, "joint", joint)
         if kind == "free":
             _add(element, "freejoint", name=name)
             return
-        coordinate, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-        values = {
-            "pos": model.jnt_pos[joint],
-            "limited": bool(model.jnt_limited[joint]),
-            "range": model.jnt_range[joint],
-            "margin": model.jnt_margin[joint],
-            "stiffness": model.jnt_stiffness[joint],
-            "damping": model.dof_damping[dof],
-            "armature": model.dof_armature[dof],
-            "frictionloss": model.dof_frictionloss[dof],
-            "solreflimit": model.jnt_solref[joint],
-            "solimplimit": model.jnt_solimp[joint],
-            "solreffriction": model.dof_solref[dof],
-            "solimpfriction": model.dof_solimp[dof],
-            "actuatorgravcomp": bool(model.jnt_actgravcomp[joint]),
-        }
+        values = self.values("jnt", joint, _JOINT) | self.values("dof", model.jnt_dofadr[joint], _DOF)
         if kind != "ball":
-            values["axis"] = model.jnt_axis[joint]
+            coordinate = model.jnt_qposadr[joint]
             values |= {"ref": model.qpos0[coordinate], "springref": model.qpos_spring[coordinate]}
-        if model.jnt_actfrclimited[joint]:
-            values |= {"actuatorfrclimited": True, "actuatorfrcrange": model.jnt_actfrcrange[joint]}
+            values["axis"] = model.jnt_axis[joint]
+        if values["actuatorfrclimited"]:
+            values["actuatorfrcrange"] = model.jnt_actfrcrange[joint]
+        else:
+            del values["actuatorfrclimited"]
         _add(element, "joint", name=name, type=kind, **values)
 
     def _write_geom(self, geom: int) -> None:
         model = self.model
-        kind = self.word(_GEOM_TYPES, model.geom_type, "geom", geom)
-        values: dict[str, Any] = {"size": model.geom_size[geom]}
+        kind = self.word("geom", model.geom_type, "geom", geom)
+        values = self.values("geom", geom, _GEOM) | {"size": model.geom_size[geom]}
         if kind in ("mesh", "hfield"):
-            values = {kind: self.name(kind, model.geom_dataid[geom])}
+            del values["size"]
+            values[kind] = self.name(kind, model.geom_dataid[geom])
         material = model.geom_matid[geom]
-        _add(
-            self.bodies[int(model.geom_bodyid[geom])],
-            "geom",
-            name=self.name("geom", geom),
-            type=kind,
-            pos=model.geom_pos[geom],
-            quat=model.geom_quat[geom],
-            contype=model.geom_contype[geom],
-            conaffinity=model.geom_conaffinity[geom],
-            condim=model.geom_condim[geom],
-            group=model.geom_group[geom],
-            priority=model.geom_priority[geom],
-            friction=model.geom_friction[geom],
-            solmix=model.geom_solmix[geom],
-            solref=model.geom_solref[geom],
-            solimp=model.geom_solimp[geom],
-            margin=model.geom_margin[geom],
-            gap=model.geom_gap[geom],
-            rgba=model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom],
-            **values,
-        )
+        values["rgba"] = model.mat_rgba[material] if material >= 0 else model.geom_rgba[geom]
+        body = self.bodies[int(model.geom_bodyid[geom])]
+        _add(body, "geom", name=self.name("geom", geom), type=kind, **values)
 
     def _write_site(self, site: int) -> None:
-        model = self.model
-        kind = self.word(_GEOM_TYPES, model.site_type, "site", site)
-        _add(
-            self.bodies[int(model.site_bodyid[site])],
-            "site",
-            name=self.name("site", site),
-            type=kind,
-            size=model.site_size[site],
-            pos=model.site_pos[site],
-            quat=model.site_quat[site],
-        )
+        kind = self.word("geom", self.model.site_type, "site", site)
+        body = self.bodies[int(self.model.site_bodyid[site])]
+        _add(body, "site", name=self.name("site", site), type=kind, **self.values("site", site, "size pos quat"))
 
     def _write_contacts(self, section: Element) -> None:
         model = self.model
         for pair in range(model.npair):
-            _add(
-                section,
-                "pair",
-                geom1=self.name("geom", model.pair_geom1[pair]),
-                geom2=self.name("geom", model.pair_geom2[pair]),
-                condim=model.pair_dim[pair],
-                friction=model.pair_friction[pair],
-                solref=model.pair_solref[pair],
-                solreffriction=model.pair_solreffriction[pair],
-                solimp=model.pair_solimp[pair],
-                margin=model.pair_margin[pair],
-                gap=model.pair_gap[pair],
-            )
+            geoms = {f"geom{end}": self.name("geom", getattr(model, f"pair_geom{end}")[pair]) for end in (1, 2)}
+            _add(section, "pair", **geoms, **self.values("pair", pair, _PAIR))
         for signature in model.exclude_signature:
             self._exclude(section, int(signature) >> 16, int(signature) & 0xFFFF)
         for body in np.flatnonzero(model.body_jntnum > 1):
@@ -289,35 +247,16 @@ class _Writer:
 
     def _write_tendon(self, section: Element, tendon: int) -> None:
         model = self.model
-        first = model.tendon_adr[tendon]
-        wraps = range(first, first + model.tendon_num[tendon])
-        element = _add(
-            section,
-            "fixed"
-            if _WRAP_TYPES.of(model.wrap_type[first], f"tendon {self.name('tendon', tendon)}") == "joint"
-            else "spatial",
-            name=self.name("tendon", tendon),
-            limited=bool(model.tendon_limited[tendon]),
-            range=model.tendon_range[tendon],
-            actuatorfrclimited=bool(model.tendon_actfrclimited[tendon]),
-            actuatorfrcrange=model.tendon_actfrcrange[tendon],
-            margin=model.tendon_margin[tendon],
-            stiffness=model.tendon_stiffness[tendon],
-            damping=model.tendon_damping[tendon],
-            armature=model.tendon_armature[tendon],
-            frictionloss=model.tendon_frictionloss[tendon],
-            springlength=model.tendon_lengthspring[tendon],
-            solreflimit=model.tendon_solref_lim[tendon],
-            solimplimit=model.tendon_solimp_lim[tendon],
-            solreffriction=model.tendon_solref_fri[tendon],
-            solimpfriction=model.tendon_solimp_fri[tendon],
-        )
-        for wrap in wraps:
+        first, name = model.tendon_adr[tendon], self.name("tendon", tendon)
+        kind = _WORDS["wrap"].of(model.wrap_type[first], f"tendon {name}")
+        values = self.values("tendon", tendon, _TENDON)
+        element = _add(section, "fixed" if kind == "joint" else "spatial", name=name, **values)
+        for wrap in range(first, first + model.tendon_num[tendon]):
             self._write_wrap(element, wrap)
 
     def _write_wrap(self, element: Element, wrap: int) -> None:
         model = self.model
-        kind = _WRAP_TYPES.of(model.wrap_type[wrap], "tendon")
+        kind = _WORDS["wrap"].of(model.wrap_type[wrap], "tendon")
         index, number = model.wrap_objid[wrap], model.wrap_prm[wrap]
         if kind == "joint":
             _add(element, "joint", joint=self.name("joint", index), coef=number)
@@ -331,7 +270,7 @@ class _Writer:
 
     def _write_equality(self, section: Element, equality: int) -> None:
         model = self.model
-        tag, values = self.word(_EQUALITY_TYPES, model.eq_type, "equality", equality), held(model, equality)
+        tag, values = self.word("equality", model.eq_type, "equality", equality), held(model, equality)
         if tag == "connect":
             values = {"anchor": values["anchor1"]}
         elif tag == "weld":  # one of sites, too: Newton's importer reads their bodies alone
@@ -340,19 +279,12 @@ class _Writer:
         for number, (kind, index) in enumerate(equality_ends(model, equality), 1):
             if index >= 0:
                 values[f"{kind}{number}"] = self.name(kind, index)
-        _add(
-            section,
-            tag,
-            name=self.name("equality", equality),
-            active=bool(model.eq_active0[equality]),
-            solref=model.eq_solref[equality],
-            solimp=model.eq_solimp[equality],
-            **values,
-        )
+        values |= self.values("eq", equality, "active=active0 solref solimp")
+        _add(section, tag, name=self.name("equality", equality), **values)
 
     def _write_actuator(self, section: Element, actuator: int) -> None:
         model = self.model
-        transmission = self.word(_TRANSMISSIONS, model.actuator_trntype, "actuator", actuator)
+        transmission = self.word("trntype", model.actuator_trntype, "actuator", actuator)
         values: dict[str, Any] = {
             word: self.name(*end)
             for word, end in zip(TARGETS[transmission], actuator_ends(model, actuator), strict=True)
@@ -362,29 +294,15 @@ class _Writer:
             values = {transmission: values["joint"]}
         if transmission == "slidercrank":
             values["cranklength"] = model.actuator_cranklength[actuator]
-        for limit in ("ctrl", "force", "act"):
-            values[f"{limit}limited"] = bool(getattr(model, f"actuator_{limit}limited")[actuator])
-            values[f"{limit}range"] = getattr(model, f"actuator_{limit}range")[actuator]
         if model.actuator_actnum[actuator]:
             values["actdim"] = model.actuator_actnum[actuator]
         if transmission in ("joint", "jointinparent", "tendon"):
             values["damping"] = (model.actuator_damping[actuator], *model.actuator_dampingpoly[actuator])
             values["armature"] = model.actuator_armature[actuator]
-        _add(
-            section,
-            "general",
-            name=self.name("actuator", actuator),
-            gear=model.actuator_gear[actuator],
-            dyntype=self.word(_DYNAMICS, model.actuator_dyntype, "actuator", actuator),
-            gaintype=self.word(_GAINS, model.actuator_gaintype, "actuator", actuator),
-            biastype=self.word(_BIASES, model.actuator_biastype, "actuator", actuator),
-            dynprm=model.actuator_dynprm[actuator],
-            gainprm=model.actuator_gainprm[actuator],
-            biasprm=model.actuator_biasprm[actuator],
-            lengthrange=model.actuator_lengthrange[actuator],
-            actearly=bool(model.actuator_actearly[actuator]),
-            **values,
-        )
+        for kind in ("dyntype", "gaintype", "biastype"):
+            values[kind] = self.word(kind, getattr(model, f"actuator_{kind}"), "actuator", actuator)
+        values |= self.values("actuator", actuator, _ACTUATOR)
+        _add(section, "general", name=self.name("actuator", actuator), **values)
 
 
 def _add(parent: Element, tag: str, **values: Any) -> Element:

@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import fnmatch
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import newton
 import warp as wp
@@ -24,14 +24,17 @@ from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_comparison as robot_judge
 from worker.simulation import robot_files, robot_mjcf, robot_reference, robot_usd, robot_values
-from worker.simulation.carriers import keep_inertias
 from worker.simulation.robot_comparison import Comparison, RobotDifference
+from worker.simulation.robot_elements import keep_inertias, short
 from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_identity import identity
 from worker.simulation.robot_reference import ReferenceModel
 from worker.simulation.robot_values import UNLIMITED
 from worker.simulation.robot_view import RobotView, actuator_value, actuators_of_dofs
 from worker.simulation.solver import mark_sliders
+
+if TYPE_CHECKING:
+    from worker.simulation.robot import Robot
 
 RAW_SOLREF = 1
 """Newton's mode of a joint that passes the ``solref`` of its limit to MuJoCo unchanged."""
@@ -57,31 +60,6 @@ FILE = "file"
 """Stands for an element where Newton's importer can't read the file at all."""
 SOLREF_DEFAULT = (0.02, 1.0)
 """MuJoCo's default ``solref``: time constant [s] and damping ratio."""
-
-
-@dataclass(frozen=True)
-class ReadingOptions:
-    """What decides how a robot's file is read.
-
-    Attributes:
-        file: See :class:`worker.simulation.robot.Robot`, as for the others.
-        fixed: Whether the root is fixed to the world; None: as in the file.
-        ignore: Patterns of geoms and sites to leave out.
-        visuals: Whether geoms that are only seen are read.
-        options: Whether the file's solver options are read.
-        accept: Patterns of differences from the file that are accepted.
-        is_placed: Whether the robot begins where its file puts it.
-        has_contacts: Whether its geoms touch as its file says.
-    """
-
-    file: str | Path
-    fixed: bool | None = None
-    ignore: Sequence[str] = ()
-    visuals: bool = True
-    options: bool = True
-    accept: Sequence[str] = ()
-    is_placed: bool = True
-    has_contacts: bool = True
 
 
 @dataclass(frozen=True)
@@ -116,7 +94,7 @@ class Reading:
 def shown(file: str | Path) -> str:
     """A file's name, for errors."""
     text = str(file)
-    return "its XML" if text.lstrip().startswith("<") else text
+    return "its XML" if robot_files.is_xml(text) else text
 
 
 class AnotherRobot(ValueError):
@@ -141,108 +119,85 @@ class AnotherRobot(ValueError):
         )
 
 
-def read(source: ReadingOptions) -> Reading:
+def read(robot: Robot) -> Reading:
     """Read a robot's file.
 
     Raises:
         AnotherRobot: The robot would be another one here.
         ValueError: The file or a mesh is missing or can't be read, or MuJoCo refuses it.
     """
-    file, name = robot_files.read(source.file), shown(source.file)
-    floating = None if source.fixed is None else not source.fixed
+    file, name = robot_files.read(robot.file), shown(robot.file)
+    reference, is_readable = None, True
     if file.format == "usd":
-        return _read_usd(source, file, floating, name)
-    reference = robot_reference.compile_file(
-        file,
-        fixed=source.fixed,
-        ignored=source.ignore,
-        shown=name,
-        is_placed=source.is_placed,
-        has_contacts=source.has_contacts,
-    )
-    model, is_readable = reference.model, True
-    try:
-        builder = _imported(source, file, floating)
-        found = _compared(source, builder, model)
-        corrected = found.differences
-    except Exception as error:  # whatever an importer stumbles over, MuJoCo's model is there
-        corrected = (RobotDifference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
-        found, is_readable = Comparison(corrected, (), {}), False
+        builder = _imported(robot, file)
+        found, corrected = robot_usd.judge(file.source, builder, robot.ignore, name, robot.accept)
+        notes = list(found.notes)
     else:
-        if file.format == "urdf" and corrected:
-            _stiffen_limits(builder)
-        found = _amended(source, builder, model, found)
-    notes = list(reference.notes)
+        reference = robot_reference.compile_file(file, robot, name)
+        notes = list(reference.notes)
+        try:
+            builder = _imported(robot, file)
+            found = robot_judge.compare(reference.model, builder, options=robot.file_options, accept=robot.accept)
+            corrected = found.differences
+        except Exception as error:  # whatever an importer stumbles over, MuJoCo's model is there
+            corrected = (RobotDifference(FILE, "import by Newton", f"impossible ({_line(error)})", "possible"),)
+            found, is_readable = Comparison(corrected, (), {}), False
+        else:
+            if (
+                file.format == "urdf" and corrected
+            ):  # limits as stiff as MuJoCo's: Newton's own are springs that hardly damp
+                _set_all_dofs(builder, "solreflimit_mode", RAW_SOLREF)
+                _set_all_dofs(builder, "solreflimit", wp.vec2(*SOLREF_DEFAULT))
+            found = _amended(robot, builder, reference.model, found)
+        if found.differences:
+            builder = _imported(
+                replace(robot, visuals=True, fixed=None), _rewritten(file, reference.model, robot, name)
+            )
+            found = robot_judge.compare(reference.model, builder, options=robot.file_options, accept=robot.accept)
+            found = _amended(robot, builder, reference.model, found)
+            if reference.looks:
+                notes.append(f"pictures lack the {reference.looks} of the file, since MuJoCo's compiled model has none")
+        notes += found.notes
     if found.differences:
-        rewritten = RobotFile(_rewritten(file, model, source.visuals, name), "mjcf")
-        builder = _imported(replace(source, visuals=True), rewritten, None)
-        found = _amended(source, builder, model, _compared(source, builder, model))
-        if reference.looks:
-            notes.append(f"pictures lack the {reference.looks} of the file, since MuJoCo's compiled model has none")
-    notes += found.notes
-    if found.differences:
-        refusal = AnotherRobot(name, found.differences, source.accept)
+        refusal = AnotherRobot(name, found.differences, robot.accept)
         if not CHANGED_ROBOTS.get() or not is_readable:
             raise refusal
-        builder = _imported(source, file, floating)  # as the training had it
-        accepted = (*reference.notes, AS_IMPORTED.format(refusal))
-        return Reading(builder, reference, corrected, accepted, identity(builder, None))
+        builder = _imported(robot, file)  # as the training had it
+        notes = [*(reference.notes if reference else ()), AS_IMPORTED.format(refusal)]
+        if reference:
+            return Reading(builder, reference, corrected, tuple(notes), identity(builder, None))
     mark_sliders(builder, found.sliders)
-    notes += _accepted(source, found)
-    own = identity(builder, model, options=source.options, accepted=found.accepted)
+    notes += [f"accepted: {each}" for each in found.accepted]
+    for pattern in robot.accept:
+        if not any(robot_judge.matches(each, (pattern,)) for each in found.accepted):
+            notes.append(f"accept={pattern!r} matches no difference from the file")
+    model = reference.model if reference else None
+    own = identity(builder, model, options=robot.file_options, accepted=found.accepted)
     return Reading(builder, reference, corrected, tuple(notes), own)
 
 
-def _read_usd(source: ReadingOptions, file: RobotFile, floating: bool | None, name: str) -> Reading:
-    builder = _imported(source, file, floating)
-    found, corrected = robot_usd.judge(file.source, builder, source.ignore, name, source.accept)
-    notes = found.notes
-    if found.differences:
-        refusal = AnotherRobot(name, found.differences, source.accept)
-        if not CHANGED_ROBOTS.get():
-            raise refusal
-        builder = _imported(source, file, floating)  # as the training had it
-        notes = (AS_IMPORTED.format(refusal),)
-    notes += tuple(_accepted(source, found))
-    return Reading(builder, None, corrected, notes, identity(builder, None, accepted=found.accepted))
-
-
-def _accepted(source: ReadingOptions, found: Comparison) -> Iterator[str]:
-    yield from (f"accepted: {each}" for each in found.accepted)
-    for pattern in source.accept:
-        if not any(robot_judge.matches(each, (pattern,)) for each in found.accepted):
-            yield f"accept={pattern!r} matches no difference from the file"
-
-
-def _compared(source: ReadingOptions, builder: newton.ModelBuilder, model: Any) -> Comparison:
-    return robot_judge.compare(model, builder, options=source.options, accept=source.accept)
-
-
-def _amended(source: ReadingOptions, builder: newton.ModelBuilder, model: Any, found: Comparison) -> Comparison:
+def _amended(robot: Robot, builder: newton.ModelBuilder, model: Any, found: Comparison) -> Comparison:
     """Correct what the importers don't read or can't say, and compare once more.
 
     They read whether there is gravity, but not which, and round moments of inertia; models enlarge small ones.
     """
     if not found.differences:
         return found
-    if source.options:
+    if robot.file_options:
         builder.gravity = wp.vec3(*robot_values.gravity(model))
     for body, index in found.bodies.items():
         builder.body_mass[index] = float(model.body_mass[body])
         builder.body_com[index] = wp.vec3(*model.body_ipos[body])
         builder.body_inertia[index] = wp.mat33(*robot_values.inertia(model, body).ravel())
     keep_inertias(builder)
-    return _compared(source, builder, model)
+    return robot_judge.compare(model, builder, options=robot.file_options, accept=robot.accept)
 
 
-def _ignored(source: ReadingOptions) -> list[str]:
-    return [fnmatch.translate(pattern) for pattern in source.ignore]
-
-
-def _imported(source: ReadingOptions, file: RobotFile, floating: bool | None) -> newton.ModelBuilder:
+def _imported(robot: Robot, file: RobotFile) -> newton.ModelBuilder:
     """The robot as Newton's importer builds it."""
-    builder = newton.ModelBuilder()
+    builder, ignored = newton.ModelBuilder(), [fnmatch.translate(pattern) for pattern in robot.ignore]
     SolverMuJoCo.register_custom_attributes(builder)
+    floating = None if robot.fixed is None else not robot.fixed
     try:
         with robot_files.quiet():  # what the importer leaves out or changes is found by comparison
             if file.format == "mjcf":
@@ -250,9 +205,9 @@ def _imported(source: ReadingOptions, file: RobotFile, floating: bool | None) ->
                     file.source,
                     floating=floating,
                     ctrl_direct=True,
-                    ignore_names=_ignored(source),
-                    parse_visuals=source.visuals,
-                    parse_mujoco_options=source.options,
+                    ignore_names=ignored,
+                    parse_visuals=robot.visuals,
+                    parse_mujoco_options=robot.file_options,
                 )
             elif file.format == "urdf":
                 builder.add_urdf(file.source, floating=floating)
@@ -260,17 +215,21 @@ def _imported(source: ReadingOptions, file: RobotFile, floating: bool | None) ->
                 builder.add_usd(
                     file.source,
                     floating=floating,
-                    ignore_paths=[f".*/{pattern}" for pattern in _ignored(source)],
-                    load_visual_shapes=source.visuals,
+                    ignore_paths=[f".*/{pattern}" for pattern in ignored],
+                    load_visual_shapes=robot.visuals,
                     only_load_enabled_rigid_bodies=True,
                     schema_resolvers=list(robot_usd.SCHEMAS),
-                    parse_mujoco_options=source.options,
+                    parse_mujoco_options=robot.file_options,
                 )
     except Exception as error:
-        raise ValueError(f"{shown(source.file)} can't be read: {_line(error)}") from error
+        raise ValueError(f"{shown(robot.file)} can't be read: {_line(error)}") from error
     if not builder.body_count:
-        raise ValueError(f"{shown(source.file)} has no body that could be a robot's")
-    _name_hinges(builder, file.hinges)
+        raise ValueError(f"{shown(robot.file)} has no body that could be a robot's")
+    labels: Any = builder.custom_attributes["mujoco:joint_dof_label"]
+    labels.values = labels.values or {}
+    for joint, label in enumerate(builder.joint_label):
+        for index, name in enumerate(file.hinges.get(short(label), ())):
+            labels.values[builder.joint_qd_start[joint] + index] = f"{label.rpartition('/')[0]}/{name}"
     _take_controls(builder)
     return builder
 
@@ -281,27 +240,17 @@ def _line(error: Exception) -> str:
     return "; ".join(re.findall(r" : '(.+?)'(?= Error in '|$)", text)) or text
 
 
-def _rewritten(file: RobotFile, model: Any, visuals: bool, shown: str) -> str:
+def _rewritten(file: RobotFile, model: Any, robot: Robot, shown: str) -> RobotFile:
     try:
-        return robot_mjcf.write(model, named=robot_files.named_options(file), visuals=visuals)
+        text = robot_mjcf.write(model, named=robot_files.named_options(file), visuals=robot.visuals)
     except ValueError as error:
         raise ValueError(f"{shown}: {error}") from error
+    return RobotFile(text, "mjcf")
 
 
-def _stiffen_limits(builder: newton.ModelBuilder) -> None:
-    """Limits of URDF joints as stiff as MuJoCo's: Newton's own are springs that hardly damp."""
-    modes: Any = builder.custom_attributes["mujoco:solreflimit_mode"]
-    solrefs: Any = builder.custom_attributes["mujoco:solreflimit"]
-    modes.values = dict.fromkeys(range(builder.joint_dof_count), RAW_SOLREF)
-    solrefs.values = dict.fromkeys(range(builder.joint_dof_count), wp.vec2(*SOLREF_DEFAULT))
-
-
-def _name_hinges(own: newton.ModelBuilder, hinges: Mapping[str, Sequence[str]]) -> None:
-    labels: Any = own.custom_attributes["mujoco:joint_dof_label"]
-    labels.values = labels.values or {}
-    for joint, label in enumerate(own.joint_label):
-        for index, name in enumerate(hinges.get(label.rpartition("/")[2], ())):
-            labels.values[own.joint_qd_start[joint] + index] = f"{label.rpartition('/')[0]}/{name}"
+def _set_all_dofs(builder: newton.ModelBuilder, name: str, value: Any) -> None:
+    attribute: Any = builder.custom_attributes[f"mujoco:{name}"]
+    attribute.values = dict.fromkeys(range(builder.joint_dof_count), value)
 
 
 def _take_controls(own: newton.ModelBuilder) -> None:
@@ -324,9 +273,8 @@ def _take_controls(own: newton.ModelBuilder) -> None:
     for actuator, target in enumerate(rows or ()):
         sources[actuator] = int(SolverMuJoCo.CtrlSource.CTRL_DIRECT)
         label = actuator_value(own, "actuator_target_label", actuator)
-        if (
-            target is None or int(target[0]) < 0
-        ) and label in dofs:  # a USD file's: the label would not say of which of two equal robots
+        # a USD file's: the label would not say of which of two equal robots
+        if (target is None or int(target[0]) < 0) and label in dofs:
             rows[actuator] = wp.vec2i(dofs[label], 0)
     actuation.register(own)
     for name, (_, default) in actuation.MOTOR_ATTRIBUTES.items():

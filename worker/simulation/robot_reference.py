@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import mujoco
 import newton
@@ -19,6 +19,9 @@ from worker.simulation import robot_files, robot_floor, robot_urdf
 from worker.simulation.patterns import check_ignored
 from worker.simulation.robot_elements import kind_of, name_of, some, word_of
 from worker.simulation.robot_files import RobotFile, asset_folders, missing_asset
+
+if TYPE_CHECKING:
+    from worker.simulation.robot import Robot
 
 _KINDS = {"jnt": "joint", "dof": "dof", "eq": "equality"} | {
     kind: kind for kind in ("body", "geom", "site", "tendon", "actuator")
@@ -43,28 +46,18 @@ class ReferenceModel:
     sensors: tuple[tuple[str, str], ...] = ()
 
 
-def compile_file(
-    file: RobotFile,
-    *,
-    fixed: bool | None,
-    ignored: Sequence[str],
-    shown: str,
-    is_placed: bool = True,
-    has_contacts: bool = True,
-) -> ReferenceModel:
+def compile_file(file: RobotFile, robot: Robot, shown: str) -> ReferenceModel:
     """Compile an MJCF or URDF file.
 
     Args:
         file: The file, whose ``spec`` is changed and compiled.
-        fixed: Whether its root is fixed to the world; None: as in the file.
-        ignored: Patterns of the names of geoms and sites to leave out.
+        robot: Says which geoms and sites to leave out, and whether its root is fixed to the world.
         shown: The file's name, for errors.
-        is_placed: Whether the robot begins where its file puts it.
-        has_contacts: Whether its geoms touch as the file says.
 
     Raises:
         ValueError: MuJoCo refuses the file; the message names the element. Or a pattern matches nothing.
     """
+    ignored = robot.ignore
     notes: list[str] = []
     if file.format == "urdf":
         spec, looks = robot_urdf.specification(file, shown, notes)
@@ -76,34 +69,35 @@ def compile_file(
     check_ignored(
         [element.name for element in (*spec.geoms, *spec.sites) if element.name], ignored, f"geom or site of {shown}"
     )
-    floors = robot_floor.compiled(spec, lambda name: _is_ignored(name, ignored))
-    left_out = _leave_out(spec, ignored, notes)
+
+    def is_ignored(name: str) -> bool:
+        return any(fnmatchcase(name, pattern) for pattern in ignored)
+
+    floors = robot_floor.compiled(spec, is_ignored)
+    left_out = _leave_out(spec, is_ignored, notes)
     looks = _without_looks(spec, file.source, notes) or looks
-    if fixed is not None:
-        _set_root(spec, fixed, shown)
+    if robot.fixed is not None:
+        _set_root(spec, robot.fixed, shown)
     if spec.option.solver == mujoco.mjtSolver.mjSOL_PGS:
         notes.append("the file asks for the solver PGS, which MuJoCo-Warp lacks: worlds use Newton's method")
     if spec.option.noslip_iterations:
         notes.append("noslip_iterations of the file are not used: a task's solver_options have none")
     model = _compiled(spec, partial(_refusal, spec, file.source, left_out, shown), notes)
-    _open_ranges(model)
+    notes += _settle_ranges(model)
     _check_numbers(model, shown)
-    notes += _empty_ranges(model)
+    is_placed = robot.position is None and robot.rotation is None
+    has_contacts = not any(collision.only for collision in robot.collisions)
     notes += robot_floor.notes(model, floors, is_placed=is_placed, has_contacts=has_contacts)
     return ReferenceModel(model, tuple(notes), looks, sensors)
 
 
-def _is_ignored(name: str, ignored: Sequence[str]) -> bool:
-    return any(fnmatchcase(name, pattern) for pattern in ignored)
-
-
-def _leave_out(spec: Any, ignored: Sequence[str], notes: list[str]) -> list[str]:
+def _leave_out(spec: Any, is_ignored: Callable[[str], bool], notes: list[str]) -> list[str]:
     """Leave out ignored geoms and sites, and the contact pairs of such geoms, which are noted.
 
     Returns:
         The names of the geoms and sites.
     """
-    elements = [element for element in (*spec.geoms, *spec.sites) if _is_ignored(element.name, ignored)]
+    elements = [element for element in (*spec.geoms, *spec.sites) if is_ignored(element.name)]
     left_out = [element.name for element in elements]
     for element in elements:
         spec.delete(element)
@@ -179,26 +173,22 @@ _LIMITS = [
 """What ``mujoco.MjModel`` limits: prefixes of its fields."""
 
 
-def _open_ranges(model: Any) -> None:
-    """Ranges that are infinite on one side get Newton's number for that, and on both sides no limit, which is the same."""
+def _settle_ranges(model: Any) -> Iterator[str]:
+    """Ranges that are infinite on one side get Newton's number for that, and on both sides no limit, which is the same.
+
+    Yields:
+        What has a range without any values, and so no limit in MuJoCo, one sentence for each kind.
+    """
     for kind, limit in _LIMITS:
         ranges, limited = getattr(model, f"{kind}_{limit}range"), getattr(model, f"{kind}_{limit}limited")
         is_open = np.isneginf(ranges[:, 0]) & np.isposinf(ranges[:, 1])
         limited[is_open], ranges[is_open] = 0, 0.0
         ranges[np.isneginf(ranges[:, 0]), 0] = -newton.MAXVAL
         ranges[np.isposinf(ranges[:, 1]), 1] = newton.MAXVAL
-
-
-def _empty_ranges(model: Any) -> Iterator[str]:
-    """What has a range without any values, and so no limit in MuJoCo."""
-    for kind, limit in _LIMITS:
-        ranges, limited = getattr(model, f"{kind}_{limit}range"), getattr(model, f"{kind}_{limit}limited")
-        empty = np.flatnonzero((ranges[:, 0] >= ranges[:, 1]) & ranges.any(1) & (limited == 0))
-        element = _KINDS[kind]
-        names = [
-            f"{element} {name_of(model, kind_of(element), int(index))} ({ranges[index, 0]:.4g} to {ranges[index, 1]:.4g})"
-            for index in empty
-        ]
+        element, names = _KINDS[kind], []
+        for index in np.flatnonzero((ranges[:, 0] >= ranges[:, 1]) & ranges.any(1) & (limited == 0)):
+            name = name_of(model, kind_of(element), int(index))
+            names.append(f"{element} {name} ({ranges[index, 0]:.4g} to {ranges[index, 1]:.4g})")
         if names:
             yield f"MuJoCo ignores an empty {limit}range: {some(names)}"
 
@@ -206,24 +196,24 @@ def _empty_ranges(model: Any) -> Iterator[str]:
 def _compiled(spec: Any, refusal: Callable[[Exception], ValueError], notes: list[str]) -> Any:
     """Compile, and where only inertias are impossible, once more with MuJoCo's own correction, which is noted."""
     with robot_files.quiet():
-        try:
-            return spec.compile()
-        except ValueError as error:
-            if "balanceinertia" not in str(error):
-                raise refusal(error) from error
-        spec.compiler.balanceinertia = True
-        try:
-            model = spec.compile()
-        except ValueError as error:
-            raise refusal(error) from error
+        for is_balanced in (False, True):
+            spec.compiler.balanceinertia |= is_balanced
+            try:
+                model = spec.compile()
+                break
+            except ValueError as error:
+                if is_balanced or "balanceinertia" not in str(error):
+                    raise refusal(error) from error
+    if not is_balanced:
+        return model
     for body in spec.bodies:
         moments = _moments(body)
         if body.explicitinertial and 2.0 * max(moments) > sum(moments) * (1.0 + 1e-9):
             listed = " ".join(f"{moment:.4g}" for moment in moments)
             corrected = " ".join(f"{moment:.4g}" for moment in model.body_inertia[body.id])
             notes.append(
-                f"body {name_of(model, mujoco.mjtObj.mjOBJ_BODY, body.id)}: no body has the principal moments of inertia {listed}, since one is greater than the sum of the "
-                f"others; they are {corrected} here (MuJoCo's balanceinertia)"
+                f"body {name_of(model, mujoco.mjtObj.mjOBJ_BODY, body.id)}: no body has the principal moments of inertia {listed}, "
+                f"since one is greater than the sum of the others; they are {corrected} here (MuJoCo's balanceinertia)"
             )
     return model
 

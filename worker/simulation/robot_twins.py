@@ -12,9 +12,23 @@ import newton
 import numpy as np
 import warp as wp
 
-from worker.simulation import carriers
-from worker.simulation.robot_connections import Ends, effective_geoms, equality_ends, pair_ends, tendon_ends
-from worker.simulation.robot_elements import Pairs, count_of, kind_of, name_of, names_of, paired, plain, short
+from worker.simulation.robot_elements import (
+    Ends,
+    Pairs,
+    count_of,
+    effective_geoms,
+    equality_ends,
+    is_carrier,
+    kind_of,
+    name_of,
+    names_of,
+    pair_ends,
+    paired,
+    plain,
+    short,
+    tendon_ends,
+    unload,
+)
 from worker.simulation.robot_values import freedoms, gravity, without_contacts
 from worker.simulation.robot_view import dof_names, joint_of
 from worker.simulation.solver import Solver, is_slider, weigh_sliders
@@ -42,12 +56,13 @@ class Stepped:
 
     def __getattr__(self, name: str) -> Any:
         compiled = getattr(self._compiled, name)
-        if not isinstance(compiled, np.ndarray):
-            return compiled
-        shape, values = compiled.shape, getattr(self._model, name)
-        found = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
-        found = found[0] if found.size and found.ndim > len(shape) else found
-        return found.reshape(shape).astype(compiled.dtype)
+        if isinstance(compiled, np.ndarray):
+            shape, values = compiled.shape, getattr(self._model, name)
+            found = values.numpy() if isinstance(values, wp.array) else np.asarray(values)
+            found = found[0] if found.size and found.ndim > len(shape) else found
+            compiled = found.reshape(shape).astype(compiled.dtype)
+        vars(self)[name] = compiled  # so that this is called once
+        return compiled
 
 
 class Twins:
@@ -59,17 +74,23 @@ class Twins:
 
     Attributes:
         file: The file's compiled model, ``mujoco.MjModel``.
+        builder: The builder.
         built: The compiled model of the builder, ``mujoco.MjModel``.
         stepped: The values of the same model that MuJoCo-Warp steps.
     """
 
     def __init__(self, reference: Any, builder: newton.ModelBuilder) -> None:
-        self.file, self._builder = reference, builder
-        model = _finalized(builder)
+        self.file, self.builder = reference, builder
+        gaps = builder.shape_gap  # as of the worlds
+        builder.shape_gap = [0.0 if gap == builder.rigid_gap else gap for gap in gaps]
+        try:
+            model = builder.finalize(device="cpu")
+        finally:
+            builder.shape_gap = gaps
         solver = Solver(
             model, use_mujoco_cpu=True, separate_worlds=False, kinematic_switchable_roots=False, disable_sensors=True
         )
-        carriers.unload(model, solver)
+        unload(model, solver)
         self.built: Any = solver.mj_model
         self.body_indices = _column(solver.mjc_body_to_newton)
         """Index of each body of :attr:`built` among the builder's, -1 for the world."""
@@ -90,15 +111,15 @@ class Twins:
 
     def built_body(self, index: int) -> str:
         """Name of a body of the built model."""
-        return short(self._builder.body_label[self.body_indices[index]]) if index else "world"
+        return short(self.builder.body_label[self.body_indices[index]]) if index else "world"
 
     def built_joint(self, index: int) -> str:
         """Name of a joint of the built model."""
         dof = self.dofs[index]
-        joint = joint_of(self._builder, dof)
-        if self._builder.joint_type[joint] in (newton.JointType.FREE, newton.JointType.BALL):
-            return short(self._builder.joint_label[joint])
-        return dof_names(self._builder, joint)[dof - self._builder.joint_qd_start[joint]]
+        joint = joint_of(self.builder, dof)
+        if self.builder.joint_type[joint] in (newton.JointType.FREE, newton.JointType.BALL):
+            return short(self.builder.joint_label[joint])
+        return dof_names(self.builder, joint)[dof - self.builder.joint_qd_start[joint]]
 
     @cached_property
     def bodies(self) -> Pairs:
@@ -106,7 +127,7 @@ class Twins:
         names = {
             index: plain(self.built_body(index))
             for index in range(1, self.built.nbody)
-            if not carriers.is_carrier(self.built_body(index))
+            if not is_carrier(self.built_body(index))
         }
         return {0: 0} | paired(names_of(self.file, "body", range(1, self.file.nbody)), names)
 
@@ -124,7 +145,7 @@ class Twins:
         pairs: Pairs = {}
         for body, twin in self.bodies.items():
             names = {
-                geom: plain(short(self._builder.shape_label[self._shapes[geom]]))
+                geom: plain(short(self.builder.shape_label[self._shapes[geom]]))
                 for geom in there
                 if built.geom_bodyid[geom] == twin
             }
@@ -134,7 +155,7 @@ class Twins:
     @cached_property
     def sites(self) -> dict[int, int | None]:
         """Index among the builder's shapes of each site of :attr:`file`; None: it is missing."""
-        model, builder = self.file, self._builder
+        model, builder = self.file, self.builder
         file_names = names_of(model, "site", range(model.nsite))
         shapes = [shape for shape, flags in enumerate(builder.shape_flags) if flags & newton.ShapeFlags.SITE]
         found: dict[int, int | None] = {}
@@ -144,12 +165,6 @@ class Twins:
             pairs = paired(mine, {shape: plain(short(builder.shape_label[shape])) for shape in there})
             found |= {site: pairs.get(site) for site in mine}
         return found
-
-    def built_site(self, shape: int) -> tuple[Any, Any]:
-        """Position [m] and quaternion wxyz of a site in its body's frame."""
-        pose: Any = self._builder.shape_transform[shape]
-        numbers = [float(number) for number in pose]
-        return numbers[:3], [numbers[6], *numbers[3:6]]
 
     @cached_property
     def tendons(self) -> Pairs:
@@ -179,6 +194,14 @@ class Twins:
             [self.in_file(ends(self.built, index)) for index in range(count_of(self.built, kind))],
         )
 
+    def pairs(self, kind: str) -> Pairs:
+        """The elements of a kind that both models have."""
+        if kind == "actuator":
+            return {index: index for index in range(min(self.file.nu, self.built.nu))}
+        names = {"body": "bodies", "equality": "equalities", "pair": "contact_pairs"}
+        found: Pairs = getattr(self, names.get(kind, f"{kind}s"))
+        return found
+
     def in_file(self, ends: Ends) -> Ends:
         """Ends in the built model by the indices of the same elements in the file; :data:`OTHER` where it has none."""
         return tuple((kind, self._indices(kind).get(index, OTHER) if index >= 0 else -1) for kind, index in ends)
@@ -189,8 +212,8 @@ class Twins:
             sites = {shape: site for site, shape in self.sites.items() if shape is not None}
             self._in_file[kind] = {site: sites.get(shape, OTHER) for site, shape in enumerate(self._site_shapes)}
         elif kind not in self._in_file:
-            pairs = {"body": "bodies", "joint": "joints", "geom": "geoms", "tendon": "tendons"}.get(kind)
-            self._in_file[kind] = {twin: index for index, twin in getattr(self, pairs).items()} if pairs else {}
+            known = kind in ("body", "joint", "geom", "tendon")
+            self._in_file[kind] = {twin: index for index, twin in self.pairs(kind).items()} if known else {}
         return self._in_file[kind]
 
     def shown_end(self, end: tuple[str, int]) -> str:
@@ -226,7 +249,7 @@ class Twins:
         """The bodies of :attr:`built` that carry further joints of a body, from the nearest on."""
         above = []
         parent = int(self.built.body_parentid[body])
-        while parent and carriers.is_carrier(self.built_body(parent)):
+        while parent and is_carrier(self.built_body(parent)):
             above.append(parent)
             parent = int(self.built.body_parentid[parent])
         return above
@@ -261,16 +284,6 @@ def _matched(*keys: tuple[Iterable[Hashable], Iterable[Hashable]]) -> Pairs:
             if index not in pairs and rest[key]:
                 pairs[index] = rest[key].pop(0)
     return pairs
-
-
-def _finalized(builder: newton.ModelBuilder) -> newton.Model:
-    """The builder's model, with the gaps of :class:`worker.simulation.worlds.Worlds`."""
-    gaps = builder.shape_gap
-    builder.shape_gap = [0.0 if gap == builder.rigid_gap else gap for gap in gaps]
-    try:
-        return builder.finalize(device="cpu")
-    finally:
-        builder.shape_gap = gaps
 
 
 def _column(array: Any) -> list[int]:

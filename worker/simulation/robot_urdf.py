@@ -41,13 +41,8 @@ PARTS = {"inertial": ("mass", "inertia"), "collision": ("geometry",)}
 def specification(file: RobotFile, shown: str, notes: list[str]) -> tuple[Any, str]:
     """A URDF file as MuJoCo reads it, with links that only fixed joints hold as bodies of their own, and without visuals.
 
-    Args:
-        file: The file.
-        shown: Its name, for errors.
-        notes: Gets what a user should know of it, one sentence each.
-
     Returns:
-        The ``mujoco.MjSpec``, and what was taken of what is only seen.
+        The ``mujoco.MjSpec``, and what was taken of what is only seen. What a user should know is added to ``notes``, one sentence each.
 
     Raises:
         ValueError: The file is wrong; the message names the link or joint.
@@ -59,14 +54,15 @@ def specification(file: RobotFile, shown: str, notes: list[str]) -> tuple[Any, s
     for element in (*root.findall("link"), *joints):
         _check_values(element, shown)
     for joint in joints:
-        _check_joint(joint, shown)
+        if (kind := joint.get("type")) not in JOINTS:
+            raise ValueError(f"{shown}: joint {joint.get('name')} is of type {kind!r}; URDF has {', '.join(JOINTS)}")
     _check_tree(root, joints, shown)
     _check_mimics(joints, shown, notes)
     notes += _unlimited(joints)
-    extension = root.find("mujoco")
-    extension = ElementTree.SubElement(root, "mujoco") if extension is None else extension
-    compiler = extension.find("compiler")
-    compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
+    compiler = root
+    for tag in ("mujoco", "compiler"):
+        found = compiler.find(tag)
+        compiler = ElementTree.SubElement(compiler, tag) if found is None else found
     compiler.attrib.update(strippath="false", fusestatic="false", discardvisual="true")
     try:
         return robot_files.parse_mjcf(ElementTree.tostring(root, encoding="unicode"), shown), looks
@@ -113,25 +109,15 @@ def _check_values(element: ElementTree.Element, shown: str) -> None:
 
 
 def _check_number(what: str, text: str, count: int) -> None:
-    numbers = [_number(word) for word in text.split()]
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        numbers = []
     if len(numbers) != count or not np.isfinite(numbers).all():
-        wanted = (
+        expected = (
             "a finite number; give it one" if count == 1 else f"{count} finite numbers; give it as many, without commas"
         )
-        raise ValueError(f"{what} is not {wanted}")
-
-
-def _number(word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        return np.nan
-
-
-def _check_joint(joint: ElementTree.Element, shown: str) -> None:
-    name, kind = joint.get("name"), joint.get("type")
-    if kind not in JOINTS:
-        raise ValueError(f"{shown}: joint {name} is of type {kind!r}; URDF has {', '.join(JOINTS)}")
+        raise ValueError(f"{what} is not {expected}")
 
 
 def _ends(joint: ElementTree.Element, shown: str, links: list[str]) -> tuple[str, str]:

@@ -43,7 +43,8 @@ def faults(both: UsdStage) -> Iterator[str]:
         ends = tuple(sorted(str(each.GetPath()) for each in owners if each))
         index, twin = both.joints.get(path), pairs.setdefault(ends, path)
         lost = [str(end) for each in targets for end in each if not both.stage.GetPrimAtPath(end)]
-        off = [end for end in ends if not _enabled(both.stage.GetPrimAtPath(end))]
+        bodies = {end: UsdPhysics.RigidBodyAPI(both.stage.GetPrimAtPath(end)) for end in ends}
+        off = [end for end, body in bodies.items() if not body.GetRigidBodyEnabledAttr().Get()]
         limits = [authored(prim, f"physics:{word}Limit") for word in ("lower", "upper")]
         if lost:
             yield f"joint {path} holds {lost[0]}, which does not exist; {nearest(lost[0], sorted(both.bodies))}"
@@ -101,21 +102,17 @@ def _joints(both: UsdStage) -> Iterator[Any]:
             yield prim
 
 
-def _enabled(body: Any) -> bool:
-    return bool(UsdPhysics.RigidBodyAPI(body).GetRigidBodyEnabledAttr().Get())
-
-
-def _locked(prim: Any, freedom: str) -> bool:
-    limit = UsdPhysics.LimitAPI(prim, freedom)
-    low, high = limit.GetLowAttr().Get(), limit.GetHighAttr().Get()
-    return low is not None and high is not None and low >= high
-
-
 def _freedoms(prim: Any) -> int:
     if prim.GetTypeName() in FREEDOMS:
         return FREEDOMS[prim.GetTypeName()]
-    limited = [schema.partition(":")[2] for schema in prim.GetAppliedSchemas() if schema.startswith("PhysicsLimitAPI:")]
-    return 6 - sum(_locked(prim, freedom) for freedom in limited if freedom != "distance")
+    locked = 0
+    for schema in prim.GetAppliedSchemas():
+        kind, _, freedom = schema.partition(":")
+        if kind == "PhysicsLimitAPI" and freedom != "distance":
+            limit = UsdPhysics.LimitAPI(prim, freedom)
+            low, high = limit.GetLowAttr().Get(), limit.GetHighAttr().Get()
+            locked += low is not None and high is not None and low >= high
+    return 6 - locked
 
 
 def _dofs(both: UsdStage, prim: Any, index: int) -> Iterator[tuple[int, str]]:
@@ -176,11 +173,8 @@ def _compare_position(both: UsdStage, prim: Any, index: int) -> None:
     pose = wp.transform(*builder.body_q[child])
     moved = wp.transform_inverse(above) * pose * wp.transform(*builder.joint_X_c[index])
     kind, column = builder.joint_type[index], builder.joint_q_start[index]
-    axis = (
-        wp.vec3(*builder.joint_axis[builder.joint_qd_start[index]])
-        if sum(builder.joint_dof_dim[index]) == 1
-        else wp.vec3()
-    )
+    is_single = sum(builder.joint_dof_dim[index]) == 1
+    axis = wp.vec3(*builder.joint_axis[builder.joint_qd_start[index]]) if is_single else wp.vec3()
     held = wp.transform_identity()
     if kind == newton.JointType.REVOLUTE:
         angle = 2.0 * math.atan2(wp.dot(axis, wp.vec3(*[*moved.q][:3])), moved.q[3])

@@ -81,15 +81,9 @@ class UsdStage:
         return prim or None
 
     def correct(self, element: str, name: str, values: Any, index: int, file: Any, within: float = 0.0) -> None:
-        """Let a value of the builder be the file's.
+        """Let a value in one of the builder's lists be the file's, in Newton's units.
 
-        Args:
-            element: Kind and path of the prim.
-            name: Of the value.
-            values: One of the builder's lists.
-            index: Of the value in it.
-            file: The value in the file, in Newton's units.
-            within: Up to this much they count as equal; 0: up to :data:`RELATIVE`.
+        Up to ``within`` they count as equal; 0: up to :data:`RELATIVE`.
         """
         built = values[index]
         if not same(built, file, within):

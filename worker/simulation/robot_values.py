@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from worker.simulation.robot_elements import word_of
+from worker.simulation.robot_elements import matrix, word_of
 
 UNLIMITED = 1e6
 """Newton's effort limit of joints without one in their file [N, N m]."""
@@ -23,20 +23,6 @@ def gravity(model: Any) -> Any:
 def length(model: Any) -> float:
     """Size of the robot [m], to which differences of places are compared."""
     return float(max(model.stat.extent, 1e-3))
-
-
-def matrix(quaternion: Any) -> Any:
-    """Rotation matrix of a quaternion wxyz, shape ``(3, 3)``."""
-    found = np.zeros(9)
-    mujoco.mju_quat2Mat(found, np.asarray(quaternion, np.float64))
-    return found.reshape(3, 3)
-
-
-def quaternion(matrix: Any) -> Any:
-    """Quaternion wxyz of a rotation matrix, shape ``(4,)``."""
-    found = np.zeros(4)
-    mujoco.mju_mat2Quat(found, np.ascontiguousarray(matrix, np.float64).ravel())
-    return found
 
 
 def inertia(model: Any, body: int) -> Any:
@@ -138,12 +124,9 @@ def freedoms(model: Any, joint: int) -> int:
 
 
 def move_joint(twins: Sequence[tuple[Any, Any, int]], amount: float, random: np.random.Generator) -> None:
-    """Move a joint in several models by the same random amount, and let it move on.
+    """Move a joint in several models, each with data and the joint's index, by the same random amount, and let it move on.
 
-    Args:
-        twins: Model, data and the joint's index in each of them.
-        amount: Greatest displacement [m, rad], and a tenth of the greatest velocity [m/s, rad/s].
-        random: Draws them.
+    ``amount`` is the greatest displacement [m, rad], and a tenth of the greatest velocity [m/s, rad/s].
     """
     model, _, joint = twins[0]
     count = freedoms(model, joint)

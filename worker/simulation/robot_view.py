@@ -15,11 +15,11 @@ from newton.solvers import SolverMuJoCo
 
 from shared_store.contract.error_text import nearest
 from worker.simulation.actuators import Input
-from worker.simulation.carriers import is_carrier
 from worker.simulation.patterns import find
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
-from worker.simulation.robot_elements import short
+from worker.simulation.robot_elements import is_carrier, short
 from worker.simulation.robot_values import UNLIMITED
+from worker.simulation.structs import filled
 from worker.simulation.worlds import Worlds
 
 Patterns = str | Iterable[str]
@@ -165,15 +165,7 @@ class RobotView:
         ]
 
     def need_ranges(self, joints: Iterable[int], purpose: str) -> None:
-        """Refuse joints without limits.
-
-        Args:
-            joints: Indices into :attr:`joint_names`.
-            purpose: What needs them, for the error: ``"reward joint_limits"``.
-
-        Raises:
-            ValueError: A joint has no lower or no upper limit.
-        """
+        """Raise ValueError where a joint has no lower or no upper limit, which ``purpose`` needs, such as ``"reward joint_limits"``."""
         missing = [joint for joint in joints if not all(map(math.isfinite, self.ranges[joint]))]
         self._refuse(missing, purpose, "limits of its position", "give it a range in the robot's file, or leave it out")
 
@@ -196,27 +188,24 @@ class RobotView:
     def arrays(self, worlds: Worlds) -> RobotArrays:
         """The robot as kernels see it, on the device of ``worlds``, which were built from this view's template."""
         device = worlds.model.device
-        arrays = RobotArrays()
-        arrays.root_coordinate, arrays.root_dof, arrays.root_body = self.root_coordinate, self.root_dof, self.root_body
-        arrays.start = self.start
-        for name in ("coordinates", "dofs", "actuators"):
-            setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.int32, device=device))
-        for name in ("defaults", "references", "efforts", "gains"):
-            setattr(arrays, name, wp.array(getattr(self, name), dtype=wp.float32, device=device))
-        ranges = np.array(self.ranges, np.float32).reshape(-1, 2)
-        arrays.ranges = wp.array(ranges, dtype=wp.vec2, device=device)
-        arrays.encoder_bias = wp.zeros((worlds.world_count, len(self.joint_names)), dtype=wp.float32, device=device)
-        return arrays
+        shape = (worlds.world_count, len(self.joint_names))
+        own = {name: getattr(self, name) for name in RobotArrays.__annotations__ if name != "encoder_bias"}
+        own["ranges"] = np.array(self.ranges, np.float32).reshape(-1, 2)
+        found: RobotArrays = filled(RobotArrays, device, shape, **own)
+        return found
 
 
 def body_arrays(worlds: Worlds) -> BodyArrays:
     """Poses, velocities and centres of mass of all bodies: views of ``worlds``, current after ``worlds.update_bodies``."""
     shape = (worlds.world_count, worlds.model.body_count // worlds.world_count)
-    arrays = BodyArrays()
-    arrays.poses = worlds.state.body_q.reshape(shape)
-    arrays.velocities = worlds.state.body_qd.reshape(shape)
-    arrays.coms = worlds.model.body_com.reshape(shape)
-    return arrays
+    found: BodyArrays = filled(
+        BodyArrays,
+        None,
+        poses=worlds.state.body_q.reshape(shape),
+        velocities=worlds.state.body_qd.reshape(shape),
+        coms=worlds.model.body_com.reshape(shape),
+    )
+    return found
 
 
 def joint_of(template: newton.ModelBuilder, dof: int) -> int:

@@ -157,13 +157,9 @@ class Solver(SolverMuJoCo):
         if self._kinds is None:
             self._kinds = wp.array(self.kinds(), dtype=wp.int32, device=self.model.device)
         model = self.mjw_model
-        wp.launch(
-            _amend_weights,
-            dim=model.body_invweight0.shape,
-            inputs=[self._kinds, model.body_dofadr, model.body_dofnum, model.body_mass],
-            outputs=[model.body_invweight0, model.dof_invweight0],
-            device=self.model.device,
-        )
+        inputs = [self._kinds, model.body_dofadr, model.body_dofnum, model.body_mass]
+        outputs = [model.body_invweight0, model.dof_invweight0]
+        wp.launch(_amend_weights, dim=outputs[0].shape, inputs=inputs, outputs=outputs, device=self.model.device)
 
     def sliders(self) -> list[int]:
         """The marked bodies, by their indices in MuJoCo's model."""

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import groupby
+from typing import Any
 
 import newton
 import numpy as np
@@ -198,7 +199,9 @@ class Terrain:
         """
         along_x, along_y = self.cells
         points = (self.levels * along_x + 1) * (self.column_count * along_y + 1)
-        free = math.inf if device is None else _free_memory(device)
+        free = math.inf if device is None else psutil.virtual_memory().available
+        if device is not None and (target := wp.get_device(device)).is_cuda:
+            free = min(free, target.free_memory)
         most = min(free / BYTES_PER_POINT, POINT_LIMIT)
         if points > most:
             there = "" if device is None else f" of {free / 2**30:,.1f} GiB that are free"
@@ -220,17 +223,7 @@ class Terrain:
         config = newton.ModelBuilder.ShapeConfig(mu=self.friction, gap=0.0)
         shapes = [self._add_columns(builder, config, *run) for run in self._runs()]
         for side, (middle, half) in enumerate(self._border()):
-            shapes.append(
-                builder.add_shape_box(
-                    -1,
-                    xform=wp.transform(middle, wp.quat_identity()),
-                    hx=half[0],
-                    hy=half[1],
-                    hz=half[2],
-                    cfg=config,
-                    label=f"{LABEL}/border {side}",
-                )
-            )
+            shapes.append(_add_box(builder, config, middle, half, f"border {side}"))
         return shapes
 
     def _runs(self) -> Iterator[tuple[int, int, str, bool]]:
@@ -257,10 +250,7 @@ class Terrain:
         half = 0.5 * self.levels * self.size[0], 0.5 * (end - first) * self.size[1]
         heights = self.heights[first * cells : end * cells + 1]
         if flat or not heights.any():
-            place = wp.transform((0.0, y, -0.5 * DEPTH), wp.quat_identity())
-            return builder.add_shape_box(
-                -1, xform=place, hx=half[0], hy=half[1], hz=0.5 * DEPTH, cfg=config, label=f"{LABEL}/{name}"
-            )
+            return _add_box(builder, config, (0.0, y), half, name)
         rows, columns = heights.shape
         return builder.add_shape_heightfield(
             xform=wp.transform((0.0, y, 0.0), wp.quat_identity()),
@@ -271,22 +261,25 @@ class Terrain:
             custom_attributes={"mujoco:hfield_base": DEPTH},
         )
 
-    def _border(self) -> Iterator[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-        """Middle and half lengths of the boxes around all patches."""
+    def _border(self) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+        """Middle and half lengths along x and y of the boxes around all patches [m]."""
         if not self.border:
             return
         x, y = -self.corner[0], -self.corner[1]
         half = 0.5 * self.border
         for side in (-1.0, 1.0):
-            yield (0.0, side * (y + half), -0.5 * DEPTH), (x + self.border, half, 0.5 * DEPTH)
-            yield (side * (x + half), 0.0, -0.5 * DEPTH), (half, y, 0.5 * DEPTH)
+            yield (0.0, side * (y + half)), (x + self.border, half)
+            yield (side * (x + half), 0.0), (half, y)
 
 
-def _free_memory(device: str) -> float:
-    """Bytes that are free on the host, or on the device where it has less."""
-    free: float = psutil.virtual_memory().available
-    target = wp.get_device(device)
-    return min(free, float(target.free_memory)) if target.is_cuda else free
+def _add_box(
+    builder: newton.ModelBuilder, config: Any, middle: tuple[float, float], half: tuple[float, float], name: str
+) -> int:
+    """Add level ground at height 0; returns its shape."""
+    place = wp.transform((*middle, -0.5 * DEPTH), wp.quat_identity())
+    return builder.add_shape_box(
+        -1, xform=place, hx=half[0], hy=half[1], hz=0.5 * DEPTH, cfg=config, label=f"{LABEL}/{name}"
+    )
 
 
 ROUGH_KINDS: Mapping[Patch, float] = {

@@ -7,6 +7,7 @@ import torch
 import warp as wp
 
 from worker.simulation.episodes import EpisodeArrays, numbered_stream
+from worker.simulation.structs import filled, views_of
 from worker.simulation.terrain import Terrain
 
 wp.set_module_options({"enable_backward": False})
@@ -94,14 +95,10 @@ def _deal(episodes: EpisodeArrays, golden: wp.float64, terrain: TerrainArrays):
 
 def flat_ground(device: str) -> TerrainArrays:
     """A terrain at height 0 everywhere, for worlds without a terrain; it has no levels and no origins."""
-    arrays = TerrainArrays()
-    arrays.levels = wp.zeros(0, dtype=wp.int32, device=device)
-    arrays.kinds = wp.zeros(0, dtype=wp.int32, device=device)
-    arrays.origins = wp.zeros((0, 0), dtype=wp.vec3, device=device)
-    arrays.heights = wp.zeros((2, 2), dtype=wp.float32, device=device)
-    arrays.ends = wp.zeros(0, dtype=wp.float64, device=device)
-    arrays.resolution = 1.0
-    return arrays
+    heights = wp.zeros((2, 2), dtype=wp.float32, device=device)
+    origins = wp.zeros((0, 0), dtype=wp.vec3, device=device)
+    found: TerrainArrays = filled(TerrainArrays, device, (0,), origins=origins, heights=heights, resolution=1.0)
+    return found
 
 
 class Ground:
@@ -120,35 +117,27 @@ class Ground:
     def __init__(self, terrain: Terrain, world_count: int, device: str) -> None:
         self.terrain = terrain
         self._device = device
-        arrays = self.arrays = TerrainArrays()
-        arrays.levels = wp.zeros(world_count, dtype=wp.int32, device=device)
-        arrays.kinds = wp.zeros(world_count, dtype=wp.int32, device=device)
-        arrays.origins = wp.array(terrain.origins, dtype=wp.vec3, device=device)
-        arrays.heights = wp.array(terrain.heights, dtype=wp.float32, device=device)
-        arrays.ends = wp.array(np.cumsum(terrain.column_shares), dtype=wp.float64, device=device)
-        arrays.corner = wp.vec2(*terrain.corner)
-        arrays.size = wp.vec2(*terrain.size)
-        arrays.resolution = terrain.resolution
-        arrays.start_levels = terrain.levels
+        first_levels = terrain.levels
         if terrain.curriculum and terrain.start_level is not None:
-            arrays.start_levels = min(terrain.start_level + 1, terrain.levels)
+            first_levels = min(terrain.start_level + 1, terrain.levels)
+        self.arrays: TerrainArrays = filled(
+            TerrainArrays,
+            device,
+            (world_count,),
+            origins=terrain.origins,
+            heights=terrain.heights,
+            ends=np.cumsum(terrain.column_shares),
+            corner=wp.vec2(*terrain.corner),
+            size=wp.vec2(*terrain.size),
+            resolution=terrain.resolution,
+            start_levels=first_levels,
+        )
 
     def deal(self, episodes: EpisodeArrays) -> None:
-        """Put every world on its first patch; call it once, after the seed is set and before worlds are placed.
-
-        Args:
-            episodes: Of the task; ``random`` holds the seed and the global index of each world.
-        """
-        wp.launch(
-            _deal,
-            dim=len(self.arrays.levels),
-            inputs=[episodes, wp.float64(GOLDEN), self.arrays],
-            device=self._device,
-        )
+        """Put every world on its first patch; call it once, after ``episodes.random`` is set and before worlds are placed."""
+        inputs = [episodes, wp.float64(GOLDEN), self.arrays]
+        wp.launch(_deal, dim=len(self.arrays.levels), inputs=inputs, device=self._device)
 
     def state_tensors(self) -> dict[str, torch.Tensor]:
         """Level and column of each world, int32, shape ``(worlds,)``: views, part of the state of a run."""
-        return {
-            "terrain_levels": wp.to_torch(self.arrays.levels),
-            "terrain_kinds": wp.to_torch(self.arrays.kinds),
-        }
+        return {f"terrain_{name}": rows for name, rows in views_of(self.arrays, "levels", "kinds").items()}

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
-import mujoco_warp
 import newton
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
 from shared_store.contract.error_text import nearest
-from worker.simulation.carriers import keep_inertias, unload
 from worker.simulation.collisions import share, share_ground
 from worker.simulation.drives import Drives, has_drives
+from worker.simulation.robot_elements import keep_inertias, unload
 from worker.simulation.solver import Solver
+from worker.simulation.structs import filled
 from worker.simulation.terrain import Terrain
 from worker.simulation.terrain_arrays import Ground
 
@@ -38,7 +37,7 @@ class WorldArrays:
         activations: State of stateful actuators, such as filters and muscles, shape ``(worlds, activations)``.
         start_q: The model's own joint coordinates, as ``joint_q``.
         start_qd: The model's own joint velocities, as ``joint_qd``.
-        overflow: Bits of every solver capacity exceeded since the last observation, shape ``(worlds,)``.
+        overflow: Bits of ``mujoco_warp.OverflowType`` in the last :meth:`Worlds.simulate`, which clears them first, shape ``(worlds,)``.
         fastest: Velocity above which the physics counts as failed [m/s, rad/s].
     """
 
@@ -52,29 +51,6 @@ class WorldArrays:
     start_qd: wp.array2d[wp.float32]
     overflow: wp.array[wp.int32]
     fastest: float
-
-
-FIRST_COORDINATE = wp.constant(7)
-"""Number of joint coordinates of a free root joint: position, quaternion xyzw. The hinges follow."""
-FIRST_DOF = wp.constant(6)
-"""Number of joint velocities of a free root joint: linear, angular. The hinges follow."""
-
-
-@wp.func
-def root_rotation(worlds: WorldArrays, world: int) -> wp.quat:
-    """Rotation from a world's first body, which hangs on a free joint, to the world frame."""
-    return wp.quat(
-        worlds.joint_q[world, 3], worlds.joint_q[world, 4], worlds.joint_q[world, 5], worlds.joint_q[world, 6]
-    )
-
-
-@wp.func
-def root_velocities(worlds: WorldArrays, world: int):
-    """Linear [m/s] and angular [rad/s] velocity of a world's first body, which hangs on a free joint, in its own frame."""
-    rotation = root_rotation(worlds, world)
-    linear = wp.vec3(worlds.joint_qd[world, 0], worlds.joint_qd[world, 1], worlds.joint_qd[world, 2])
-    angular = wp.vec3(worlds.joint_qd[world, 3], worlds.joint_qd[world, 4], worlds.joint_qd[world, 5])
-    return wp.quat_rotate_inv(rotation, linear), wp.quat_rotate_inv(rotation, angular)
 
 
 @wp.func
@@ -104,20 +80,6 @@ def restore_start(worlds: WorldArrays, world: int):
 
 FEW_ITERATIONS = 8
 """Up to this many solver iterations are recorded one after the other, not as a loop that ends when all worlds are done."""
-
-# Reaching the solver's own iteration limits is a chosen trade of accuracy for time; the other bits mean that contacts or
-# constraints were dropped.
-_CAPACITY_BITS = wp.constant(
-    int(mujoco_warp.OverflowType.ALL & ~(mujoco_warp.OverflowType.ITERATIONS | mujoco_warp.OverflowType.LS_ITERATIONS))
-)
-
-
-@wp.kernel
-def _gather_overflow(solver_overflow: wp.array[wp.int32], overflow: wp.array[wp.int32]):
-    """The solver clears its bits before each control step: keep them until they are counted."""
-    world = wp.tid()
-    overflow[world] = overflow[world] | (solver_overflow[world] & _CAPACITY_BITS)
-
 
 _SET_HERE: Mapping[str, Any] = {"disable_sensors": True, "kinematic_switchable_roots": False, "separate_worlds": True}
 """Solver options that a task can't set: neither MuJoCo's sensors nor kinematic roots are used, and both cost time in every step."""
@@ -204,22 +166,27 @@ class Worlds:
         self.timestep = timestep
         self.substeps = substeps
 
-        self.arrays = WorldArrays()
-        self.arrays.fastest = fastest
-        self.arrays.joint_q = self.state.joint_q.reshape((world_count, -1))
-        self.arrays.joint_qd = self.state.joint_qd.reshape((world_count, -1))
-        self.arrays.start_q = self.model.joint_q.reshape((world_count, -1))
-        self.arrays.start_qd = self.model.joint_qd.reshape((world_count, -1))
+        def rows(array: Any) -> Any:
+            return array.reshape((world_count, -1))
+
         self.drives = Drives(self.model, self.solver, world_count) if has_drives(self.model) else None
-        if self.drives is None:
-            self.arrays.controls = vars(self.control)["mujoco"].ctrl.reshape((world_count, -1))
-        else:
-            self.arrays.controls = self.drives.controls
+        if self.drives is not None:
             self.solver.before_substep = [self.drives.launch]
-        self.arrays.drives = self.solver.mjw_data.qfrc_actuator
-        self.arrays.warm_start = self.solver.mjw_data.qacc_warmstart
-        self.arrays.activations = self.solver.mjw_data.act
-        self.arrays.overflow = wp.zeros(world_count, dtype=wp.int32, device=device)
+        data = self.solver.mjw_data
+        self.arrays: WorldArrays = filled(
+            WorldArrays,
+            device,
+            joint_q=rows(self.state.joint_q),
+            joint_qd=rows(self.state.joint_qd),
+            controls=self.drives.controls if self.drives else rows(vars(self.control)["mujoco"].ctrl),
+            drives=data.qfrc_actuator,
+            warm_start=data.qacc_warmstart,
+            activations=data.act,
+            start_q=rows(self.model.joint_q),
+            start_qd=rows(self.model.joint_qd),
+            overflow=data.overflow,
+            fastest=fastest,
+        )
 
     def simulate(self) -> None:
         """Advance all worlds by ``substeps`` physics steps; launches only, so that it can be captured.
@@ -227,22 +194,10 @@ class Worlds:
         This updates joint coordinates but not body poses (:meth:`update_bodies`), which cost 2 to 3 % of a training and which tasks that
         read only joints don't need.
         """
-        with self._joints_alone():
-            self.solver.step(self.state, self.state, self.control, None, self.timestep)
-        wp.launch(
-            _gather_overflow,
-            dim=self.world_count,
-            inputs=[self.solver.mjw_data.overflow],
-            outputs=[self.arrays.overflow],
-            device=self.model.device,
-        )
-
-    @contextlib.contextmanager
-    def _joints_alone(self) -> Iterator[None]:
-        """The solver ends each step with the kinematics of all articulations: in here there are none."""
+        # the solver ends each step with the kinematics of all articulations: here there are none
         count, self.model.articulation_count = self.model.articulation_count, 0
         try:
-            yield
+            self.solver.step(self.state, self.state, self.control, None, self.timestep)
         finally:
             self.model.articulation_count = count
 

@@ -22,8 +22,8 @@ from newton.sensors import SensorCamera
 
 from shared_store.volume.files import write_atomic
 from worker.settings.errors import UserError
-from worker.simulation.on_host import numbers
 from worker.simulation.rendering import look
+from worker.simulation.structs import numbers
 from worker.telemetry.messages import tiled
 from worker.telemetry.stage import Stage
 from worker.telemetry.tap import Tap, TapReader

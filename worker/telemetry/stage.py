@@ -21,9 +21,9 @@ from shared_store.volume.layout import Run
 from worker.learning.job import configure, user_errors, with_texts
 from worker.settings.errors import UserError
 from worker.simulation import robot_files
-from worker.simulation.carriers import is_carrier
-from worker.simulation.on_host import numbers
+from worker.simulation.robot_elements import is_carrier
 from worker.simulation.robot_view import RobotView
+from worker.simulation.structs import numbers
 from worker.simulation.terrain import Terrain
 from worker.tasks import find_task
 from worker.tasks.run.task import Task

@@ -216,7 +216,7 @@ def walking() -> SensorContext:
         (Frames(bodies="trunk", relative_to="t", relative_to_site="imu"), ["either relative_to, a body, or"]),
         (Frames(bodies="trunk", reference_robot="robot"), ["Frames.reference_robot: name its body"]),
         (Frames(sites="sole"), ["no site of robot matches 'sole'", "left_sole"]),
-        (Imu(), ["Imu: give either site or body"]),
+        (Imu(), ["Imu: give either body or site"]),
         (Imu(site="*"), ["Imu: name one body or site", "imu, left_sole"]),
         (Imu(body="trunk", robot="rbt"), ["Imu.robot: there is no robot 'rbt'"]),
         (AngularMomentum(robot="rbt"), ["AngularMomentum.robot: there is no robot 'rbt'"]),

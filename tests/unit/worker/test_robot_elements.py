@@ -35,9 +35,7 @@ def test_impossible_inertias_of_a_urdf_file_are_corrected_by_name() -> None:
     ("before", "after", "words"),
     [
         ('value="1"', 'value="inf"', r"link a: value='inf' of its <mass> is not a finite number"),
-        ('value="1"', 'value="nan"', r"link a: value='nan' of its <mass> is not a finite number"),
         ('value="1"', 'value="-1"', r"link a: its mass is -1; give it one greater than 0"),
-        ('iyy=".01"', 'iyy="inf"', r"link a: iyy='inf' of its <inertia> is not a finite number"),
         ('lower="-0.3"', 'lower="nan"', r"joint j: lower='nan' of its <limit> is not a finite number"),
     ],
 )
@@ -209,13 +207,6 @@ def test_a_root_may_be_fixed_or_free() -> None:
 def test_a_mocap_body_stays_where_the_root_moves_freely() -> None:
     target = f'<mujoco><worldbody><body name="m" mocap="true"/><body name="b">{BOX}</body></worldbody></mujoco>'
     assert twins(read(target, fixed=False)).built.nq == 7
-
-
-def test_a_mimic_joint_follows() -> None:
-    link = '<link name="c"><inertial><mass value="1"/><inertia ixx=".01" iyy=".01" izz=".01" ixy="0" ixz="0" iyz="0"/></inertial></link>'
-    joint = f'<joint name="k" type="revolute"><parent link="a"/><child link="c"/><axis xyz="0 1 0"/>{LIMIT}<mimic joint="j" multiplier="-2"/></joint>'
-    reading = read(urdf(more=link + joint))
-    np.testing.assert_allclose(twins(reading).built.eq_data[0, :2], [0.0, -2.0])
 
 
 @pytest.mark.parametrize(

@@ -299,15 +299,6 @@ def test_the_identity_of_a_robot_is_the_same_where_a_processor_rounds_otherwise(
     assert identity(reading.builder, model) == reading.identity
 
 
-def test_the_identity_of_a_robot_follows_its_model_and_not_its_notation() -> None:
-    heavier = SAME["a plain hinge"].replace('mass="1"', 'mass="1.5"')
-    noted = SAME["a plain hinge"].replace("<mujoco>", "<mujoco><!-- the same -->")
-    plain, other, same = (read(file).identity for file in (SAME["a plain hinge"], heavier, noted))
-    assert plain == same and plain.digest != other.digest and (plain.mass, other.mass) == (1.0, 1.5)
-    assert {name for name in plain.elements if plain.elements[name] != other.elements[name]} == {"body b"}
-    assert (plain.elements["body b"]["mass"], other.elements["body b"]["mass"]) == (1.0, 1.5)
-
-
 def test_joints_that_count_from_a_reference_are_noted() -> None:
     shifted = mjcf('<joint name="j" axis="0 1 0" ref="30" range="0 60"/>' + BOX)
     assert read(shifted).notes == (

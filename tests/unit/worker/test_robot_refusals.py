@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import UserDict
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from worker.simulation.actuators import (
 )
 from worker.simulation.collisions import Collision
 from worker.simulation.objects import Box, Capsule, Sphere
-from worker.simulation.patterns import resolve
 from worker.simulation.robot import Robot
 from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
@@ -144,17 +142,6 @@ def test_a_file_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path, na
     assert all(part in said for part in parts.split(" ... ")), said
 
 
-def test_a_missing_mesh_of_an_mjcf_file(tmp_path: Path):
-    """Newton alone would build the robot without it."""
-    (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes" / "shank.stl").write_text("")
-    assets = '<compiler meshdir="meshes"/><asset><mesh name="shank" file="shnk.stl"/></asset>'
-    (tmp_path / "leg.xml").write_text(leg(assets, '<geom type="mesh" mesh="shank"/>'))
-    there = r"leg\.xml: its mesh shnk\.stl is missing in .*meshes; did you mean shank\.stl\?"
-    with pytest.raises(ValueError, match=there):
-        template(Robot(tmp_path / "leg.xml", actuators=(SERVO,)))
-
-
 @pytest.mark.parametrize(
     ("mesh", "words"),
     [
@@ -265,11 +252,6 @@ def test_the_same_servos_added_as_the_refusal_says_follow_their_controls() -> No
 def test_an_option_of_the_solver_that_is_not_a_task_s_is_refused(options: dict[str, Any], message: str) -> None:
     said = refusal(worlds_of, mjcf('<motor joint="hinge"/>'), **options)
     assert said.startswith("solver_options: ") and message in said and "\n" not in said
-
-
-def test_values_by_pattern_may_come_in_any_mapping() -> None:
-    values = UserDict({"left_*": 1.0, "*": 2.0})
-    assert resolve(["left_knee", "right_knee"], values, "joint") == [1.0, 2.0]
 
 
 def test_no_other_exception_than_a_value_error_escapes() -> None:

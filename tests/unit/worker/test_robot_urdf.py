@@ -8,8 +8,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from tests.support.worker.robot_texts import read
 from worker.simulation.robot import Robot
-from worker.simulation.robot_reading import ReadingOptions, read
 from worker.simulation.robot_twins import Twins
 
 INERTIA = '<inertia ixx=".1" iyy=".1" izz=".1" ixy="0" ixz="0" iyz="0"/>'
@@ -37,7 +37,7 @@ def follower(mimic: str, kind: str = "revolute") -> str:
 
 def test_a_joint_that_mimics_has_one_equality_as_in_mujoco() -> None:
     text = follower('<mimic joint="i" multiplier="-2" offset=".1"/>')
-    reading = read(ReadingOptions(text, fixed=True))
+    reading = read(text, fixed=True)
     assert reading.reference is not None
     own, built = mujoco.MjModel.from_xml_string(text), Twins(reading.reference.model, reading.builder).built
     assert own.neq == reading.reference.model.neq == built.neq == 1
@@ -54,7 +54,7 @@ def test_a_joint_that_mimics_has_one_equality_as_in_mujoco() -> None:
 def test_a_joint_that_mimics_a_fixed_one_does_not_follow_and_says_so() -> None:
     assert (
         "joint k does not follow i (<mimic>), since i is fixed, as in MuJoCo"
-        in read(ReadingOptions(follower('<mimic joint="i"/>', kind="fixed"))).notes
+        in read(follower('<mimic joint="i"/>', kind="fixed")).notes
     )
 
 
@@ -104,8 +104,8 @@ def test_a_floating_joint_at_the_root_can_be_left_out_as_its_refusal_says() -> N
     with pytest.raises(
         ValueError, match=r"leave out that joint and link a, and b moves freely with Robot\(..., fixed=False\)"
     ):
-        read(ReadingOptions(urdf(link("a"), link("b"), joint("f", "a", "b", kind="floating"))))
-    reading = read(ReadingOptions(urdf(link("b")), fixed=False))
+        read(urdf(link("a"), link("b"), joint("f", "a", "b", kind="floating")))
+    reading = read(urdf(link("b")), fixed=False)
     assert reading.reference is not None and reading.reference.model.nq == 7
 
 
@@ -117,7 +117,7 @@ def test_a_file_is_read_in_the_encoding_that_it_declares(ending: str, tmp_path: 
     }
     file = tmp_path / f"robot.{ending}"
     file.write_bytes(f'<?xml version="1.0" encoding="ISO-8859-1"?>\n{texts[ending]}'.encode("latin-1"))
-    assert "body größe" in read(ReadingOptions(file)).identity.elements
+    assert "body größe" in read(file).identity.elements
     file.write_bytes(texts[ending].encode("latin-1"))
     with pytest.raises(ValueError, match=r"is not text in UTF-8 .*declare its encoding in its first line"):
-        read(ReadingOptions(file))
+        read(file)

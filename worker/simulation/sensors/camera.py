@@ -28,8 +28,8 @@ from worker.simulation.rendering import (
 )
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import BodyFrame, Sensor, SensorContext, SensorDeclaration, place_pose
+from worker.simulation.structs import views_of
 
 if TYPE_CHECKING:
     from worker.settings.task import Randomization
@@ -145,167 +145,21 @@ def _stack_masks(
         push(camera.images, world, channel, channels, row, column, value, episodes.ages[world] == 0)
 
 
-@dataclass(frozen=True)
-class CameraSensor:
-    """A pinhole camera in every world, on a body, on a site, or fixed in the world.
-
-    :class:`worker.tasks.declare.declaration.Image` makes an observation group of its images; terms read :class:`CameraArrays`. Bytes of each kind:
-
-    - ``color``: red, green and blue in sRGB; the background is light blue.
-    - ``grey``: the luma of the colour image.
-    - ``depth``: distance along the camera's axis, from 0 at ``near`` or nearer to 255 at ``far``, beyond it or in the background;
-      ``CameraArrays.depths`` has it in metres.
-    - ``segmentation``: one channel for each name in ``of``: 255 where a pixel shows it, else 0; the background is 0 in all channels.
-
-    Attributes:
-        body: Name in the file of the body that carries it. Without ``body`` and ``site`` it is fixed in the world.
-        site: Name of the site that carries it.
-        robot: The robot with that body or site.
-        position: Position in the frame of the body, site or world [m].
-        target: Point in that frame at the centre of the image [m]; +z of the frame is up.
-        rotation: From the camera's axes (x to the right, y up, looking along -z) to those of the frame, quaternion xyzw. Without
-            ``target`` and ``rotation`` it looks along the frame's +x, with +z up.
-        width: Width of an image [px].
-        height: Height of an image [px].
-        fov: Vertical field of view [rad].
-        kind: ``"color"``, ``"grey"``, ``"depth"`` or ``"segmentation"``.
-        frames: Images of one observation: the present one and those of the control steps before.
-        samples: Rays per pixel, for colour and grey.
-        near: Least depth in an image [m].
-        far: Greatest depth in an image [m].
-        of: Classes of a segmentation: names of robots and objects, and ``"ground"``; None: all of them.
-        position_range: Each camera is mounted up to this far from its place, along each axis of its body or the world [m]; a number, or
-            three.
-        angle_range: Each camera is turned by up to this about each of its own axes [rad]; a number, or three.
-        redraw: Whether every episode draws these offsets again; otherwise each world keeps its own.
-
-    Raises:
-        ValueError: A number is out of range, or two arguments exclude each other.
-    """
-
-    body: str | None = None
-    site: str | None = None
-    robot: str = "robot"
-    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    target: tuple[float, float, float] | None = None
-    rotation: tuple[float, float, float, float] | None = None
-    width: int = 64
-    height: int = 64
-    fov: float = 0.9
-    kind: Literal["color", "grey", "depth", "segmentation"] = "color"
-    frames: int = 1
-    samples: int = 1
-    near: float = 0.05
-    far: float = 5.0
-    of: Sequence[str] | None = None
-    position_range: float | tuple[float, float, float] = 0.0
-    angle_range: float | tuple[float, float, float] = 0.0
-    redraw: bool = False
-    arrays_type: ClassVar[Any] = CameraArrays
-
-    def __post_init__(self) -> None:
-        kinds = (*CHANNELS, "segmentation")
-        if self.kind not in kinds:
-            raise ValueError(f"CameraSensor.kind: there is no kind {self.kind!r}; {nearest(str(self.kind), kinds)}")
-        for name, greatest in (("width", 1024), ("height", 1024), ("frames", 16), ("samples", 64)):
-            value = getattr(self, name)
-            if not isinstance(value, int) or not 1 <= value <= greatest:
-                raise ValueError(f"CameraSensor.{name}: expected a whole number from 1 to {greatest}, found {value!r}")
-        if not 0.0 < self.fov < math.pi:
-            raise ValueError(f"CameraSensor.fov: expected an angle between 0 and pi [rad], found {self.fov!r}")
-        if not 0.0 <= self.near < self.far < math.inf:
-            raise ValueError(
-                f"CameraSensor.near and far: expected 0 <= near < far [m], found {self.near!r} and {self.far!r}"
-            )
-        for name in ("position_range", "angle_range"):
-            if not all(0.0 <= each < math.inf for each in _three(getattr(self, name))):
-                raise ValueError(f"CameraSensor.{name}: expected 0 or more, found {getattr(self, name)!r}")
-        self._check_choices()
-
-    def _check_choices(self) -> None:
-        """Refuse arguments that exclude each other."""
-        if self.body is not None and self.site is not None:
-            raise ValueError(
-                "CameraSensor: give either body or site, and not both; without them it is fixed in the world"
-            )
-        if self.target is not None and self.rotation is not None:
-            raise ValueError("CameraSensor: give either target or rotation, and not both")
-        if self.target is not None and math.dist(self.position, self.target) < 1e-6:
-            raise ValueError(
-                f"CameraSensor.target: the camera stands there, at {list(self.position)}; choose another point"
-            )
-        if self.rotation is not None and not 0.0 < math.hypot(*self.rotation) < math.inf:
-            raise ValueError(f"CameraSensor.rotation: expected a quaternion xyzw, found {list(self.rotation)}")
-        if self.samples > 1 and self.kind not in ("color", "grey"):
-            raise ValueError(
-                f"CameraSensor.samples: {self.kind} takes one ray per pixel, since it can't be averaged over rays"
-            )
-        if self.of is not None and self.kind != "segmentation":
-            raise ValueError(f"CameraSensor.of: only a segmentation takes it, and kind is {self.kind}")
-
-    def channels(self, views: Mapping[str, RobotView]) -> tuple[str, ...]:
-        """Names of the channels of one frame, with these robots and objects. Raises ValueError where ``of`` names another."""
-        if self.kind != "segmentation":
-            return CHANNELS[self.kind]
-        there = (*views, *((GROUND,) if GROUND not in views else ()))
-        for name in self.of if self.of is not None else ():
-            if name not in there:
-                raise ValueError(f"CameraSensor.of: there is no robot or object {name!r}; {nearest(name, there)}")
-        return tuple(self.of) if self.of is not None else there
-
-    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each channel of an observation, those of earlier frames ending on ``_1``, ``_2``, …
-
-        Raises:
-            ValueError: The body, site, robot or object is unknown.
-        """
-        if self.body is not None or self.site is not None:
-            place_names(views, "CameraSensor", self.robot, bodies=self.body, sites=self.site)
-        channels = self.channels(views)
-        return [f"{name}_{back}" if back else name for back in range(self.frames) for name in channels]
-
-    @property
-    def mount(self) -> wp.transform:
-        """The camera's pose in the frame of its body, of its site, or of the world."""
-        if self.rotation is not None:
-            return wp.transform(wp.vec3(*self.position), wp.normalize(wp.quat(*self.rotation)))
-        ahead = (self.position[0] + 1.0, self.position[1], self.position[2])
-        return look(self.position, ahead if self.target is None else self.target)
-
-    def build(self, context: SensorContext) -> Camera:
-        """The cameras of these worlds.
-
-        Raises:
-            ValueError: The body, site, robot or object is unknown, or a pattern matches several.
-        """
-        place = BodyFrame("world", -1, wp.transform_identity())
-        if self.body is not None or self.site is not None:
-            place = only_one(find_places(context, "CameraSensor", self.robot, self.body, self.site), "CameraSensor")
-        return Camera(self, place, context)
-
-
-class Camera:
-    """:class:`CameraSensor` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+class Camera(Sensor):
+    """:class:`CameraSensor` of some worlds.
 
     It renders in :meth:`settle` alone, once a control step. Before that ``Worlds.update_bodies`` and ``Worlds.update_shapes`` must
     have been called.
-
-    Args:
-        declared: As a task declares it.
-        place: The frame that carries it.
-        context: The worlds.
 
     Attributes:
         images: ``arrays.images`` as a torch tensor, uint8, shape ``(worlds, channels * frames, height, width)``.
     """
 
-    needs_bodies = False  # only after resets, where the task sees to it
-
-    def __init__(self, declared: CameraSensor, place: BodyFrame, context: SensorContext) -> None:
-        self.names = tuple(declared.rows(context.views))
-        self.declared, self._bodies, self._episodes = declared, context.bodies, context.episodes
-        self._worlds, self._device, self._body = context.worlds, context.device, place.body
-        count, size = context.worlds.world_count, (declared.height, declared.width)
+    def __init__(self, declared: CameraSensor, context: SensorContext) -> None:
+        super().__init__(context, declared.rows(context.views))
+        (place,) = declared.places(context.views)
+        self.declared, self._body = declared, place.body
+        count, size = self._count, (declared.height, declared.width)
         self._stream = -_FIRST_STREAM - 2 * (zlib.crc32(context.name.encode()) % 2**19)
         mount = wp.transform_multiply(place.pose, declared.mount)
         self._place = wp.full(count, mount, dtype=wp.transform, device=self._device)
@@ -363,9 +217,6 @@ class Camera:
         inputs = [self._bodies, self._body, self._mounts, self.arrays]
         wp.launch(_follow, dim=self._mounts.shape, inputs=inputs, device=self._device)
 
-    def advance(self) -> None:
-        """No-op: one image per step is taken, after resets."""
-
     def settle(self) -> None:
         """Render every world; an episode's first image also fills the earlier frames."""
         declared = self.declared
@@ -392,6 +243,140 @@ class Camera:
         """The images, the depths that rewards may read, and the camera poses of the running episodes."""
         tensors = views_of(self.arrays, "images", *(("depths",) if self.declared.kind == "depth" else ()))
         return tensors | ({"mounts": wp.to_torch(self._mounts)} if self.declared.redraw else {})
+
+
+@dataclass(frozen=True)
+class CameraSensor(SensorDeclaration):
+    """A pinhole camera in every world, on a body, on a site, or fixed in the world.
+
+    :class:`worker.tasks.declare.declaration.Image` makes an observation group of its images; terms read :class:`CameraArrays`. Bytes of each kind:
+
+    - ``color``: red, green and blue in sRGB; the background is light blue.
+    - ``grey``: the luma of the colour image.
+    - ``depth``: distance along the camera's axis, from 0 at ``near`` or nearer to 255 at ``far``, beyond it or in the background;
+      ``CameraArrays.depths`` has it in metres.
+    - ``segmentation``: one channel for each name in ``of``: 255 where a pixel shows it, else 0; the background is 0 in all channels.
+
+    Attributes:
+        body: Name in the file of the body that carries it. Without ``body`` and ``site`` it is fixed in the world.
+        site: Name of the site that carries it.
+        robot: The robot with that body or site.
+        position: Position in the frame of the body, site or world [m].
+        target: Point in that frame at the centre of the image [m]; +z of the frame is up.
+        rotation: From the camera's axes (x to the right, y up, looking along -z) to those of the frame, quaternion xyzw. Without
+            ``target`` and ``rotation`` it looks along the frame's +x, with +z up.
+        width: Width of an image [px].
+        height: Height of an image [px].
+        fov: Vertical field of view [rad].
+        kind: ``"color"``, ``"grey"``, ``"depth"`` or ``"segmentation"``.
+        frames: Images of one observation: the present one and those of the control steps before.
+        samples: Rays per pixel, for colour and grey.
+        near: Least depth in an image [m].
+        far: Greatest depth in an image [m].
+        of: Classes of a segmentation: names of robots and objects, and ``"ground"``; None: all of them.
+        position_range: Each camera is mounted up to this far from its place, along each axis of its body or the world [m]; a number, or
+            three.
+        angle_range: Each camera is turned by up to this about each of its own axes [rad]; a number, or three.
+        redraw: Whether every episode draws these offsets again; otherwise each world keeps its own.
+
+    Raises:
+        ValueError: A number is out of range, or two arguments exclude each other.
+    """
+
+    body: str | None = None
+    site: str | None = None
+    robot: str = "robot"
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    target: tuple[float, float, float] | None = None
+    rotation: tuple[float, float, float, float] | None = None
+    width: int = 64
+    height: int = 64
+    fov: float = 0.9
+    kind: Literal["color", "grey", "depth", "segmentation"] = "color"
+    frames: int = 1
+    samples: int = 1
+    near: float = 0.05
+    far: float = 5.0
+    of: Sequence[str] | None = None
+    position_range: float | tuple[float, float, float] = 0.0
+    angle_range: float | tuple[float, float, float] = 0.0
+    redraw: bool = False
+    arrays_type: ClassVar[Any] = CameraArrays
+    sensor_type: ClassVar[Any] = Camera
+
+    def __post_init__(self) -> None:
+        kinds = (*CHANNELS, "segmentation")
+        if self.kind not in kinds:
+            raise ValueError(f"CameraSensor.kind: there is no kind {self.kind!r}; {nearest(str(self.kind), kinds)}")
+        for name, greatest in (("width", 1024), ("height", 1024), ("frames", 16), ("samples", 64)):
+            value = getattr(self, name)
+            if not isinstance(value, int) or not 1 <= value <= greatest:
+                raise ValueError(f"CameraSensor.{name}: expected a whole number from 1 to {greatest}, found {value!r}")
+        if not 0.0 < self.fov < math.pi:
+            raise ValueError(f"CameraSensor.fov: expected an angle between 0 and pi [rad], found {self.fov!r}")
+        if not 0.0 <= self.near < self.far < math.inf:
+            raise ValueError(
+                f"CameraSensor.near and far: expected 0 <= near < far [m], found {self.near!r} and {self.far!r}"
+            )
+        for name in ("position_range", "angle_range"):
+            if not all(0.0 <= each < math.inf for each in _three(getattr(self, name))):
+                raise ValueError(f"CameraSensor.{name}: expected 0 or more, found {getattr(self, name)!r}")
+        self._check_choices()
+
+    def _check_choices(self) -> None:
+        """Refuse arguments that exclude each other."""
+        if self.body is not None and self.site is not None:
+            raise ValueError(
+                "CameraSensor: give either body or site, and not both; without them it is fixed in the world"
+            )
+        if self.target is not None and self.rotation is not None:
+            raise ValueError("CameraSensor: give either target or rotation, and not both")
+        if self.target is not None and math.dist(self.position, self.target) < 1e-6:
+            raise ValueError(
+                f"CameraSensor.target: the camera stands there, at {list(self.position)}; choose another point"
+            )
+        if self.rotation is not None and not 0.0 < math.hypot(*self.rotation) < math.inf:
+            raise ValueError(f"CameraSensor.rotation: expected a quaternion xyzw, found {list(self.rotation)}")
+        if self.samples > 1 and self.kind not in ("color", "grey"):
+            raise ValueError(
+                f"CameraSensor.samples: {self.kind} takes one ray per pixel, since it can't be averaged over rays"
+            )
+        if self.of is not None and self.kind != "segmentation":
+            raise ValueError(f"CameraSensor.of: only a segmentation takes it, and kind is {self.kind}")
+
+    def channels(self, views: Mapping[str, RobotView]) -> tuple[str, ...]:
+        """Names of the channels of one frame, with these robots and objects. Raises ValueError where ``of`` names another."""
+        if self.kind != "segmentation":
+            return CHANNELS[self.kind]
+        there = (*views, *((GROUND,) if GROUND not in views else ()))
+        for name in self.of if self.of is not None else ():
+            if name not in there:
+                raise ValueError(f"CameraSensor.of: there is no robot or object {name!r}; {nearest(name, there)}")
+        return tuple(self.of) if self.of is not None else there
+
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of each channel of an observation, those of earlier frames ending on ``_1``, ``_2``, …
+
+        Raises:
+            ValueError: The body, site, robot or object is unknown.
+        """
+        self.places(views)
+        channels = self.channels(views)
+        return [f"{name}_{back}" if back else name for back in range(self.frames) for name in channels]
+
+    @property
+    def mount(self) -> wp.transform:
+        """The camera's pose in the frame of its body, of its site, or of the world."""
+        if self.rotation is not None:
+            return wp.transform(wp.vec3(*self.position), wp.normalize(wp.quat(*self.rotation)))
+        ahead = (self.position[0] + 1.0, self.position[1], self.position[2])
+        return look(self.position, ahead if self.target is None else self.target)
+
+    def places(self, views: Mapping[str, RobotView]) -> list[BodyFrame]:
+        """The frame that carries it, the world's by default. Raises ValueError where there is none, or a pattern matches several."""
+        if self.body is None and self.site is None:
+            return [BodyFrame("world", -1, wp.transform_identity())]
+        return super().places(views)
 
 
 def _three(value: float | Sequence[float]) -> tuple[float, float, float]:

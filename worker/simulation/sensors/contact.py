@@ -7,16 +7,20 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import mujoco
+import newton
+import numpy as np
 import torch
 import warp as wp
 
+from shared_store.contract.error_text import nearest
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.contact_geoms import ContactRows, contact_rows
-from worker.simulation.sensors.places import place_names
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_names
+from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
 
+GROUND = "ground"
+"""Name in ``ContactSensor.against`` of everything fixed to the world."""
 _PYRAMIDAL = wp.constant(int(mujoco.mjtCone.mjCONE_PYRAMIDAL))
 
 
@@ -235,8 +239,153 @@ def _forget(ages: wp.array[wp.int32], contacts: ContactArrays, norms: wp.array3d
         norms[world, column, step] = 0.0
 
 
+class Contacts(Sensor):
+    """A :class:`ContactSensor` of some worlds."""
+
+    state = (
+        *("found", "forces", "air_time", "contact_time", "last_air_time", "last_contact_time"),
+        *("peaks", "history"),
+    )
+
+    def __init__(self, declared: ContactSensor, context: SensorContext) -> None:
+        worlds = context.worlds
+        if not worlds.solver.mjw_data.naconmax:
+            raise ValueError(
+                "ContactSensor: the solver computes no contacts; give solver_options nconmax and no disable_contacts"
+            )
+        names, columns, others = _rows(declared, context)
+        super().__init__(context, names)
+        self._fine, self._shape = declared.fine, (self._count, len(names))
+        self._columns = wp.array(columns, dtype=wp.int32, device=self._device)
+        self._others = wp.array(others, dtype=wp.int32, device=self._device)
+        steps, seconds = worlds.substeps if declared.fine else 1, 1.0 / context.control_hz
+        self.arrays = filled(
+            ContactArrays,
+            self._device,
+            self._shape,
+            history=context.array((*self._shape, steps), wp.float32),
+            seconds=seconds,
+            step=worlds.timestep if declared.fine else seconds,
+        )
+        self._norms = context.array((*self._shape, steps), wp.float32)
+        self._sums, self._solved = filled(_Sums, self._device, self._shape), _solved(worlds.solver)
+        if declared.fine:
+            worlds.after_substep.append(self._measure)
+
+    def advance(self) -> None:
+        """Measure the last physics step, unless each was measured when it was taken."""
+        if not self._fine:
+            self._measure()
+
+    def settle(self) -> None:
+        """Clear contact and air times of worlds that were just reset."""
+        self._launch(_forget, self._shape, self._episodes.ages, self.arrays, self._norms)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """All measurements: times continue from them, and code before the next physics reads them."""
+        return super().state_tensors() | {"norms": wp.to_torch(self._norms)}
+
+    def _measure(self) -> None:
+        if count := self._solved.worlds.shape[0]:
+            self._launch(_gather, count, self._solved, self._columns, self._others, self._sums)
+        self._launch(_measure, self._shape, self._sums, self.arrays, self._norms)
+
+
+def _rows(declared: ContactSensor, context: SensorContext) -> tuple[list[str], np.ndarray, np.ndarray]:
+    """Names of the columns; column of each geom of the solver, -1 where it is not measured; whether touching each geom counts, 1 or 0."""
+    view = context.view(declared.robot, "ContactSensor.robot")
+    shapes = _shapes_of_geoms(context)
+    groups = _groups(declared, view, set(shapes.tolist()))
+    if declared.together:
+        groups = {view.name: [shape for measured in groups.values() for shape in measured]}
+    columns = np.full(len(shapes), -1, np.int32)
+    for column, measured in enumerate(groups.values()):
+        columns[np.isin(shapes, measured)] = column
+    others = _others(declared, context, shapes)
+    if not others.any():
+        raise ValueError(f"ContactSensor.against: nothing of {declared.against!r} can collide; {_choices(context)}")
+    return list(groups), columns, others.astype(np.int32)
+
+
+def _groups(declared: ContactSensor, view: RobotView, solid: set[int]) -> dict[str, list[int]]:
+    """The shapes of each column, by the column's name. ``solid`` are the shapes that can collide; matches without one are skipped."""
+    if (declared.bodies is None) == (declared.geoms is None):
+        raise ValueError("ContactSensor: give either bodies or geoms, a pattern or several, and not both")
+    if declared.geoms is None:
+        patterns, names, find = declared.bodies, view.body_names, view.find_bodies
+        owned = [
+            [shape for shape, owner in zip(view.geoms, view.geom_bodies, strict=True) if owner == body]
+            for body in view.bodies
+        ]
+    else:
+        patterns, names, find, owned = declared.geoms, view.geom_names, view.find_geoms, [[geom] for geom in view.geoms]
+    found: dict[int, list[int]] = {}
+    for pattern in [patterns] if isinstance(patterns, str) or not patterns else patterns:
+        matching = find(pattern or ())
+        colliding = {index: owned[index] for index in matching if not solid.isdisjoint(owned[index])}
+        if not colliding:
+            what = ", ".join(names[index] for index in matching)
+            able = [name for name, shape in zip(view.geom_names, view.geoms, strict=True) if shape in solid]
+            raise ValueError(
+                f"ContactSensor: {what} of {view.name} has no geom that can collide; geoms that can: {', '.join(able) or 'none'}"
+            )
+        found |= colliding
+    return {names[index]: found[index] for index in sorted(found)}
+
+
+def _shapes_of_geoms(context: SensorContext) -> np.ndarray:
+    """Index of each geom of the solver among the shapes of a world; -1 where it is in all worlds."""
+    model, solver = context.worlds.model, context.worlds.solver
+    shapes = solver.mjc_geom_to_newton_shape.numpy()[0]
+    world = model.shape_world.numpy()
+    first = int((world == 0).argmax())  # those of the first world are in one piece
+    own: np.ndarray = np.where((shapes >= 0) & (world[shapes] == 0), shapes - first, -1)
+    return own
+
+
+def _others(declared: ContactSensor, context: SensorContext, shapes: np.ndarray) -> np.ndarray:
+    """The solver's geoms that the measured ones must touch."""
+    if declared.against is None:
+        return np.ones(len(shapes), bool)
+    if declared.against != GROUND:
+        if declared.against not in context.views:
+            raise ValueError(f"ContactSensor.against: there is no {declared.against!r}; {_choices(context, declared)}")
+        return np.isin(shapes, context.views[declared.against].geoms)
+    model = context.worlds.model
+    shape = context.worlds.solver.mjc_geom_to_newton_shape.numpy()[0]
+    owned = np.isin(shapes, [geom for view in context.views.values() for geom in view.geoms])
+    plane = model.shape_type.numpy()[shape] == int(newton.GeoType.PLANE)
+    ground: np.ndarray = (shape >= 0) & (model.shape_body.numpy()[shape] < 0) & (plane | ~owned)
+    return ground
+
+
+def _choices(context: SensorContext, declared: ContactSensor | None = None) -> str:
+    known: Sequence[str] = (GROUND, *context.views)
+    return nearest(declared.against if declared else "", known) + " (None: anything)"
+
+
+def _solved(solver: Any) -> Any:
+    """The :class:`_Solved` of a solver: views of its own arrays, whose addresses never change."""
+    data, contact = solver.mjw_data, solver.mjw_data.contact
+    return filled(
+        _Solved,
+        None,
+        cone=int(solver.mjw_model.opt.cone),
+        rows=int(data.njmax),
+        count=data.nacon,
+        worlds=contact.worldid,
+        geoms=contact.geom,
+        dims=contact.dim,
+        frames=contact.frame,
+        friction=contact.friction.view(wp.float32).reshape((contact.friction.shape[0], -1)),
+        adhesion=contact.adhesion,
+        addresses=contact.efc_address,
+        forces=data.efc.force,
+    )
+
+
 @dataclass(frozen=True)
-class ContactSensor:
+class ContactSensor(SensorDeclaration):
     """Contacts of bodies or of geoms with the ground, a robot, an object or anything.
 
     Attributes:
@@ -257,93 +406,10 @@ class ContactSensor:
     fine: bool = False
     together: bool = False
     arrays_type: ClassVar[Any] = ContactArrays
+    sensor_type: ClassVar[Any] = Contacts
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
         if self.together:
             return [self.robot]
         return place_names(views, "ContactSensor", self.robot, bodies=self.bodies, geoms=self.geoms)
-
-    def build(self, context: SensorContext) -> Contacts:
-        """The sensor of these worlds.
-
-        Raises:
-            ValueError: Neither or both of ``bodies`` and ``geoms`` are given, a pattern or a name matches nothing that can
-                collide, or the solver computes no contacts.
-        """
-        if not context.worlds.solver.mjw_data.naconmax:
-            raise ValueError(
-                "ContactSensor: the solver computes no contacts; give solver_options nconmax and no disable_contacts"
-            )
-        return Contacts(contact_rows(self, context), self.fine, context)
-
-
-class Contacts:
-    """A :class:`ContactSensor` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    Args:
-        rows: Measured geoms and their counterparts.
-        fine: Whether every physics step is measured.
-        context: The worlds.
-    """
-
-    needs_bodies = False
-
-    def __init__(self, rows: ContactRows, fine: bool, context: SensorContext) -> None:
-        self.names = rows.names
-        self._fine, self._episodes, self._device = fine, context.episodes, context.device
-        worlds = context.worlds
-        self._shape = (worlds.world_count, len(rows.names))
-        self._columns = wp.array(rows.columns, dtype=wp.int32, device=self._device)
-        self._others = wp.array(rows.others, dtype=wp.int32, device=self._device)
-        steps = worlds.substeps if fine else 1
-        self.arrays = ContactArrays()
-        for name in ("air_time", "contact_time", "last_air_time", "last_contact_time", "peaks"):
-            setattr(self.arrays, name, context.array(self._shape, wp.float32))
-        self.arrays.history = context.array((*self._shape, steps), wp.float32)
-        self.arrays.seconds = 1.0 / context.control_hz
-        self.arrays.step = worlds.timestep if fine else self.arrays.seconds
-        self._norms = context.array((*self._shape, steps), wp.float32)
-        self._sums = _Sums()
-        for struct in (self.arrays, self._sums):
-            struct.found = context.array(self._shape, wp.int32)
-            struct.forces = context.array(self._shape, wp.vec3)
-        self._sums.strongest = context.array(self._shape, wp.float32)
-        self._solved = _solved(worlds.solver)
-        if fine:
-            worlds.after_substep.append(self._measure)
-
-    def advance(self) -> None:
-        """Measure the last physics step, unless each was measured when it was taken."""
-        if not self._fine:
-            self._measure()
-
-    def settle(self) -> None:
-        """Clear contact and air times of worlds that were just reset."""
-        inputs = [self._episodes.ages, self.arrays, self._norms]
-        wp.launch(_forget, dim=self._shape, inputs=inputs, device=self._device)
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """All measurements: times continue from them, and code before the next physics reads them."""
-        times = ("air_time", "contact_time", "last_air_time", "last_contact_time")
-        tensors = views_of(self.arrays, "found", "forces", *times, "peaks", "history")
-        return tensors | {"norms": wp.to_torch(self._norms)}
-
-    def _measure(self) -> None:
-        count = self._solved.worlds.shape[0]
-        if count:
-            inputs = [self._solved, self._columns, self._others, self._sums]
-            wp.launch(_gather, dim=count, inputs=inputs, device=self._device)
-        wp.launch(_measure, dim=self._shape, inputs=[self._sums, self.arrays, self._norms], device=self._device)
-
-
-def _solved(solver: Any) -> _Solved:
-    """Views of the solver's own arrays, whose addresses never change."""
-    data, solved = solver.mjw_data, _Solved()
-    contact = data.contact
-    solved.cone, solved.rows = int(solver.mjw_model.opt.cone), int(data.njmax)
-    solved.count, solved.worlds, solved.geoms = data.nacon, contact.worldid, contact.geom
-    solved.dims, solved.frames, solved.adhesion = contact.dim, contact.frame, contact.adhesion
-    solved.friction = contact.friction.view(wp.float32).reshape((contact.friction.shape[0], -1))
-    solved.addresses, solved.forces = contact.efc_address, data.efc.force
-    return solved

@@ -15,8 +15,8 @@ import warp as wp
 from shared_store.contract.error_text import nearest
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.ik_kernels import Chain, IkArrays, begin_targets, move_frame
-from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import BodyFrame, Sensor, SensorContext, SensorDeclaration
+from worker.simulation.structs import filled, views_of
 
 AXES = ("x", "y", "z", "roll", "pitch", "yaw")
 """Directions in which a frame may be moved: along the axes of the root or of the world [m], and about them [rad]."""
@@ -26,8 +26,88 @@ FRAMES = ("root", "world")
 """Frames whose axes can be used."""
 
 
+class IkSolver(Sensor):
+    """:class:`DifferentialIK` of some worlds. It acts before the physics."""
+
+    needs_bodies = True
+
+    def __init__(self, declared: DifferentialIK, context: SensorContext) -> None:
+        super().__init__(context, declared.rows(context.views))
+        (place,) = declared.places(context.views)
+        self._robot, count = context.robots[declared.robot], self._count
+        view, joints = context.views[declared.robot], declared.driven(context.views)
+        self.arrays = filled(IkArrays, self._device, (count, len(self.names)))
+        rows = [AXES.index(axis) for axis in declared.axes if axis in AXES]
+        columns = [column for column, axis in enumerate(declared.axes) if axis in AXES]
+        turn = -1
+        if QUATERNION[0] in declared.axes:
+            turn = [*declared.axes].index(QUATERNION[0])
+            rows, columns = [*rows, 3, 4, 5], [*columns, 0, 0, 0]
+        self._chain = filled(
+            Chain,
+            self._device,
+            body=place.body,
+            pose=place.pose,
+            in_world=declared.frame == "world",
+            absolute=declared.absolute,
+            turn=turn,
+            rows=rows,
+            columns=columns,
+            weights=[(declared.position_weight if row < 3 else declared.orientation_weight) ** 2 for row in rows],
+            joints=joints,
+            ranges=_ranges(view, joints, declared.soft_factor),
+            damping=declared.damping**2,
+            posture=declared.posture_weight**2,
+            limits=declared.limit_weight**2,
+            max_step=declared.max_step,
+            errors=context.array((len(rows), count), wp.float32),
+            jacobian=context.array((len(rows), len(joints), count), wp.float32),
+            matrix=context.array((len(joints), len(joints), count), wp.float32),
+            steps=context.array((len(joints), count), wp.float32),
+            goes_on=declared.from_targets,
+            targets=context.array((count, len(joints)), wp.float32),
+            **self._joints(view, joints),
+        )
+
+    def _joints(self, view: RobotView, joints: list[int]) -> dict[str, Any]:
+        """Bodies, anchors and axes of the joints, which are the same in every world."""
+        model, dofs = self._worlds.model, [view.dofs[joint] for joint in joints]
+        owners = np.searchsorted(model.joint_qd_start.numpy(), dofs, side="right") - 1
+        mounts, axes = model.joint_X_c.numpy()[owners], model.joint_axis.numpy()[dofs]
+        return {
+            "children": [view.joint_bodies[joint] for joint in joints],
+            "slides": [view.joint_types[joint] == newton.JointType.PRISMATIC for joint in joints],
+            "anchors": mounts[:, :3],
+            "axes": [
+                wp.quat_rotate(wp.quat(*mount[3:]), wp.vec3(*axis)) for mount, axis in zip(mounts, axes, strict=True)
+            ],
+        }
+
+    def act(self) -> None:
+        """Write the joints' targets after all actions are written. Call ``Worlds.update_bodies`` first."""
+        self._launch(move_frame, self._count, self._worlds.arrays, self._bodies, self._robot, self._chain, self.arrays)
+
+    def settle(self) -> None:
+        """Forget the last targets where an episode begins."""
+        if self._chain.goes_on:
+            self._launch(begin_targets, self._count, self._worlds.arrays, self._episodes, self._robot, self._chain)
+
+    def state_tensors(self) -> dict[str, torch.Tensor]:
+        """The last targets, if the next ones are relative to them."""
+        return views_of(self._chain, "targets") if self._chain.goes_on else {}
+
+
+def _ranges(view: RobotView, joints: list[int], share: float) -> np.ndarray:
+    """Ranges of joints of which a share counts, about their middle [m, rad], shape ``(joints, 2)``, float32."""
+    ranges = np.array([view.ranges[joint] for joint in joints])
+    limited = np.isfinite(ranges).all(axis=1)
+    margins = 0.5 * (1.0 - share) * (ranges[limited, 1] - ranges[limited, 0])
+    ranges[limited] += np.stack((margins, -margins), axis=1)
+    return ranges.astype(np.float32)
+
+
 @dataclass(frozen=True)
-class DifferentialIK:
+class DifferentialIK(SensorDeclaration):
     """Joints that move a frame of a robot. ``terms.move_frame`` gives a displacement or a pose, and damped least squares computes
     position targets.
 
@@ -74,6 +154,7 @@ class DifferentialIK:
     soft_factor: float = 1.0
     from_targets: bool = False
     arrays_type: ClassVar[Any] = IkArrays
+    sensor_type: ClassVar[Any] = IkSolver
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """Name of each column, such as ``hand_x``.
@@ -81,15 +162,11 @@ class DifferentialIK:
         Raises:
             ValueError: A name matches nothing, a number is out of range, or a joint can't move the frame about or along one axis.
         """
-        if (self.body is None) == (self.site is None):
-            raise ValueError("DifferentialIK: give either body or site, and not both")
-        names = place_names(views, "DifferentialIK", self.robot, bodies=self.body, sites=self.site)
-        if len(names) != 1:
-            raise ValueError(f"DifferentialIK: name one body or site; the pattern matches {', '.join(names)}")
+        (place,) = self.places(views)
         self._check_axes()
         self._check_numbers()
-        self._check_joints(views[self.robot], names[0])
-        return [f"{names[0]}_{axis}" for axis in self.axes]
+        self._check_joints(views[self.robot], place)
+        return [f"{place.name}_{axis}" for axis in self.axes]
 
     def _check_axes(self) -> None:
         known = AXES[:3] + QUATERNION if self.absolute else AXES
@@ -120,15 +197,13 @@ class DifferentialIK:
         if self.soft_factor > 1.0:
             raise ValueError(f"DifferentialIK.soft_factor is {self.soft_factor}; use a number > 0, at most 1")
 
-    def _check_joints(self, view: RobotView, name: str) -> None:
-        bodies = dict(zip(view.body_names, view.bodies, strict=True))
-        body = bodies[name] if self.site is None else view.site_bodies[view.site_names.index(name)]
-        between = view.joints_moving(body)
+    def _check_joints(self, view: RobotView, place: BodyFrame) -> None:
+        between = view.joints_moving(place.body)
         for joint in view.find_joints(self.joints):
             if joint not in between:
                 those = ", ".join(view.joint_names[each] for each in between) or "none"
                 raise ValueError(
-                    f"DifferentialIK.joints: {view.joint_names[joint]} does not move {name}; those that do: {those}"
+                    f"DifferentialIK.joints: {view.joint_names[joint]} does not move {place.name}; those that do: {those}"
                 )
             if view.joint_types[joint] not in (newton.JointType.REVOLUTE, newton.JointType.PRISMATIC):
                 raise ValueError(
@@ -140,7 +215,7 @@ class DifferentialIK:
         """Indices of the joints in ``RobotView.joint_names``. Raises ValueError where a pattern matches nothing."""
         return views[self.robot].find_joints(self.joints)
 
-    def said(self, views: Mapping[str, RobotView]) -> str:
+    def description(self, views: Mapping[str, RobotView]) -> str:
         """Describes the use of the columns in words, with every number."""
         view = views[self.robot]
         joints = ", ".join(view.joint_names[joint] for joint in self.driven(views))
@@ -153,96 +228,3 @@ class DifferentialIK:
             f"{', '.join(self.axes)} ({numbers})"
             f"{', each from the last targets' if self.from_targets else ''}"
         )
-
-    def build(self, context: SensorContext) -> IkSolver:
-        """The solver that moves the frame in these worlds.
-
-        Raises:
-            ValueError: As :meth:`rows`.
-        """
-        self.rows(context.views)
-        found = find_places(context, "DifferentialIK", self.robot, self.body, self.site)
-        return IkSolver(self, only_one(found, "DifferentialIK"), context)
-
-
-class IkSolver:
-    """:class:`DifferentialIK` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    Args:
-        declared: As a task declares it.
-        place: The frame.
-        context: The worlds.
-    """
-
-    needs_bodies = True
-
-    def __init__(self, declared: DifferentialIK, place: BodyFrame, context: SensorContext) -> None:
-        self.names = tuple(declared.rows(context.views))
-        self._worlds, self._bodies, self._device = context.worlds, context.bodies, context.device
-        self._robot, self._episodes = context.robots[declared.robot], context.episodes
-        joints, count = declared.driven(context.views), context.worlds.world_count
-        self.arrays = IkArrays()
-        self.arrays.wanted = context.array((count, len(self.names)), wp.float32)
-        self._chain = chain = Chain()
-        chain.body, chain.pose = place.body, place.pose
-        self._read_joints(context.views[declared.robot], joints)
-        self._read_ranges(context.views[declared.robot], joints, declared.soft_factor)
-        rows = [AXES.index(axis) for axis in declared.axes if axis in AXES]
-        columns = [column for column, axis in enumerate(declared.axes) if axis in AXES]
-        chain.in_world, chain.absolute, chain.turn = declared.frame == "world", declared.absolute, -1
-        if QUATERNION[0] in declared.axes:
-            chain.turn = [*declared.axes].index(QUATERNION[0])
-            rows, columns = [*rows, 3, 4, 5], [*columns, 0, 0, 0]
-        weights = [(declared.position_weight if row < 3 else declared.orientation_weight) ** 2 for row in rows]
-        chain.rows, chain.columns = self._array(rows, wp.int32), self._array(columns, wp.int32)
-        chain.weights = self._array(weights, wp.float32)
-        chain.damping, chain.max_step = declared.damping**2, declared.max_step
-        chain.posture, chain.limits = declared.posture_weight**2, declared.limit_weight**2
-        chain.errors = context.array((len(rows), count), wp.float32)
-        chain.jacobian = context.array((len(rows), len(joints), count), wp.float32)
-        chain.matrix = context.array((len(joints), len(joints), count), wp.float32)
-        chain.steps = context.array((len(joints), count), wp.float32)
-        chain.goes_on = declared.from_targets
-        chain.targets = context.array((count, len(joints)), wp.float32)
-
-    def _array(self, values: Any, dtype: Any) -> wp.array[Any]:
-        return wp.array(values, dtype=dtype, device=self._device)
-
-    def _read_joints(self, view: RobotView, joints: list[int]) -> None:
-        """Bodies, anchors and axes of the joints, which are the same in every world."""
-        model, dofs = self._worlds.model, [view.dofs[joint] for joint in joints]
-        owners = np.searchsorted(model.joint_qd_start.numpy(), dofs, side="right") - 1
-        mounts = model.joint_X_c.numpy()[owners]
-        axes = model.joint_axis.numpy()[dofs]
-        turned = [wp.quat_rotate(wp.quat(*mount[3:]), wp.vec3(*axis)) for mount, axis in zip(mounts, axes, strict=True)]
-        self._chain.children = self._array([view.joint_bodies[joint] for joint in joints], wp.int32)
-        slides = [view.joint_types[joint] == newton.JointType.PRISMATIC for joint in joints]
-        self._chain.slides = self._array(slides, wp.int32)
-        self._chain.anchors = self._array(mounts[:, :3], wp.vec3)
-        self._chain.axes = self._array(turned, wp.vec3)
-        self._chain.joints = self._array(joints, wp.int32)
-
-    def _read_ranges(self, view: RobotView, joints: list[int], share: float) -> None:
-        ranges = np.array([view.ranges[joint] for joint in joints])
-        limited = np.isfinite(ranges).all(axis=1)
-        margins = 0.5 * (1.0 - share) * (ranges[limited, 1] - ranges[limited, 0])
-        ranges[limited] += np.stack((margins, -margins), axis=1)
-        self._chain.ranges = self._array(ranges.astype(np.float32), wp.vec2)
-
-    def act(self) -> None:
-        """Write the joints' targets after all actions are written. Call ``Worlds.update_bodies`` first."""
-        inputs = [self._worlds.arrays, self._bodies, self._robot, self._chain, self.arrays]
-        wp.launch(move_frame, dim=self._worlds.world_count, inputs=inputs, device=self._device)
-
-    def advance(self) -> None:
-        """No-op: it acts before the physics."""
-
-    def settle(self) -> None:
-        """Forget the last targets where an episode begins."""
-        if self._chain.goes_on:
-            inputs = [self._worlds.arrays, self._episodes, self._robot, self._chain]
-            wp.launch(begin_targets, dim=self._worlds.world_count, inputs=inputs, device=self._device)
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """The last targets, if the next ones are relative to them."""
-        return views_of(self._chain, "targets") if self._chain.goes_on else {}

@@ -6,13 +6,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
 import warp as wp
 
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose, place_velocity
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import (
+    BodyFrame,
+    Sensor,
+    SensorContext,
+    SensorDeclaration,
+    find_place,
+    place_pose,
+    place_velocity,
+)
+from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -61,8 +68,32 @@ def _measure(
     frames.angular[world, column] = wp.quat_rotate_inv(turned, angular - origin_angular)
 
 
+class FrameSensor(Sensor):
+    """:class:`Frames` of some worlds."""
+
+    needs_bodies = True
+    state = ("positions", "rotations", "linear", "angular")
+
+    def __init__(self, declared: Frames, context: SensorContext) -> None:
+        places, self._reference = declared.places(context.views), declared.reference(context.views)
+        super().__init__(context, [place.name for place in places])
+        self._columns = wp.array([place.body for place in places], dtype=wp.int32, device=self._device)
+        self._locals = wp.array([place.pose for place in places], dtype=wp.transform, device=self._device)
+        self.arrays = filled(FrameArrays, self._device, (self._count, len(places)))
+
+    def advance(self) -> None:
+        """Measure the present poses and velocities."""
+        reference = self._reference.body, self._reference.pose
+        inputs = (self._bodies, self._columns, self._locals, *reference, self.arrays)
+        self._launch(_measure, (self._count, len(self.names)), *inputs)
+
+    def settle(self) -> None:
+        """Measure again, since resets moved some worlds."""
+        self.advance()
+
+
 @dataclass(frozen=True)
-class Frames:
+class Frames(SensorDeclaration):
     """Poses and velocities of bodies or sites.
 
     They are those of MuJoCo's ``framepos``, ``framequat``, ``framelinvel`` and ``frameangvel``, with and without a reference.
@@ -83,22 +114,10 @@ class Frames:
     relative_to_site: str | None = None
     reference_robot: str | None = None
     arrays_type: ClassVar[Any] = FrameArrays
+    sensor_type: ClassVar[Any] = FrameSensor
 
-    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
-        return place_names(views, "Frames", self.robot, bodies=self.bodies, sites=self.sites)
-
-    def build(self, context: SensorContext) -> FrameSensor:
-        """The sensor of these worlds.
-
-        Raises:
-            ValueError: Neither or both of ``bodies`` and ``sites`` are given, a pattern or a name matches nothing, or the reference is not
-                one body or site.
-        """
-        places = find_places(context, "Frames", self.robot, self.bodies, self.sites)
-        return FrameSensor(places, self._reference(context), context)
-
-    def _reference(self, context: SensorContext) -> BodyFrame:
+    def reference(self, views: Mapping[str, RobotView]) -> BodyFrame:
+        """The frame of reference. Raises ValueError where it is not one body or site."""
         if self.relative_to is None and self.relative_to_site is None:
             if self.reference_robot is not None:
                 raise ValueError(
@@ -108,42 +127,4 @@ class Frames:
         if self.relative_to is not None and self.relative_to_site is not None:
             raise ValueError("Frames: give either relative_to, a body, or relative_to_site, and not both")
         owner = self.robot if self.reference_robot is None else self.reference_robot
-        found = find_places(context, "Frames.relative_to", owner, self.relative_to, self.relative_to_site)
-        return only_one(found, "Frames.relative_to")
-
-
-class FrameSensor:
-    """:class:`Frames` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    Args:
-        places: The measured frames.
-        reference: The frame of reference.
-        context: The worlds.
-    """
-
-    needs_bodies = True
-
-    def __init__(self, places: list[BodyFrame], reference: BodyFrame, context: SensorContext) -> None:
-        self.names = tuple(place.name for place in places)
-        self._bodies, self._device = context.bodies, context.device
-        self._shape = (context.worlds.world_count, len(places))
-        self._columns = wp.array([place.body for place in places], dtype=wp.int32, device=self._device)
-        self._locals = wp.array([place.pose for place in places], dtype=wp.transform, device=self._device)
-        self._reference = reference
-        self.arrays = FrameArrays()
-        for name in ("positions", "linear", "angular"):
-            setattr(self.arrays, name, context.array(self._shape, wp.vec3))
-        self.arrays.rotations = context.array(self._shape, wp.quat)
-
-    def advance(self) -> None:
-        """Measure the present poses and velocities."""
-        inputs = [self._bodies, self._columns, self._locals, self._reference.body, self._reference.pose, self.arrays]
-        wp.launch(_measure, dim=self._shape, inputs=inputs, device=self._device)
-
-    def settle(self) -> None:
-        """Measure again, since resets moved some worlds."""
-        self.advance()
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """All measurements: code before the next physics reads them."""
-        return views_of(self.arrays, "positions", "rotations", "linear", "angular")
+        return find_place(views, "Frames.relative_to", owner, self.relative_to, self.relative_to_site)

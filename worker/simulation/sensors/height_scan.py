@@ -8,14 +8,13 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import torch
 import warp as wp
 
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, find_places, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_pose
+from worker.simulation.structs import filled
 from worker.simulation.terrain_arrays import TerrainArrays, flat_ground, ground_height
 
 wp.set_module_options({"enable_backward": False})
@@ -156,8 +155,45 @@ class RingPattern:
         return np.concatenate((np.zeros((1, 2)), ring)) if self.center else ring
 
 
+class HeightScanSensor(Sensor):
+    """:class:`HeightScan` of some worlds. It names each point: body or site, and its position in the pattern [m]."""
+
+    needs_bodies = True
+    state = ("heights", "points")
+
+    def __init__(self, declared: HeightScan, context: SensorContext) -> None:
+        declared.rows(context.views)
+        pattern, places = declared.pattern.points(), declared.places(context.views)
+        super().__init__(context, [f"{place.name} {x:+.2f} {y:+.2f}" for place in places for x, y in pattern])
+        ground = self._worlds.ground
+        self._terrain = ground.arrays if ground else flat_ground(self._device)
+        offset = wp.transform(declared.offset, wp.quat_identity())
+        self._scan = filled(
+            _Scan,
+            self._device,
+            bodies=[place.body for place in places],
+            locals=[wp.transform_multiply(place.pose, offset) for place in places],
+            pattern=pattern.astype(np.float32),
+            alignment=ALIGNMENTS.index(declared.alignment),
+            farthest=declared.max_distance,
+        )
+        self.arrays = filled(HeightScanArrays, self._device, (self._count, len(self.names)))
+
+    def advance(self) -> None:
+        """Measure all worlds."""
+        self._measure(fresh_only=False)
+
+    def settle(self) -> None:
+        """Measure again in worlds that were just reset."""
+        self._measure(fresh_only=True)
+
+    def _measure(self, fresh_only: bool) -> None:
+        inputs = (fresh_only, self._episodes, self._bodies, self._terrain, self._scan, self.arrays)
+        self._launch(_scan, (self._count, len(self.names)), *inputs)
+
+
 @dataclass(frozen=True)
-class HeightScan:
+class HeightScan(SensorDeclaration):
     """Heights of frames on a robot above the ground around them.
 
     Heights are looked up in the terrain, exactly on the triangles that shapes collide with. Vertical rays that see only the ground would
@@ -182,76 +218,12 @@ class HeightScan:
     offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     max_distance: float = 5.0
     arrays_type: ClassVar[Any] = HeightScanArrays
+    sensor_type: ClassVar[Any] = HeightScanSensor
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
-        frames = place_names(views, "HeightScan", self.robot, bodies=self.bodies, sites=self.sites)
-        return [str(point) for point in range(len(frames) * len(self.pattern.points()))]
-
-    def build(self, context: SensorContext) -> HeightScanSensor:
-        """The sensor of these worlds.
-
-        Raises:
-            ValueError: Neither or both of ``bodies`` and ``sites`` are given, a pattern matches nothing, the alignment is unknown, or the
-                pattern is invalid.
-        """
+        """Number of each point. Raises ValueError where a pattern or a name matches nothing, or a number is out of range."""
         if self.alignment not in ALIGNMENTS:
             raise ValueError(f"HeightScan.alignment is {self.alignment!r}; use one of {', '.join(ALIGNMENTS)}")
         if not self.max_distance > 0:
             raise ValueError(f"HeightScan.max_distance is {self.max_distance}; use a number of metres > 0")
-        places = find_places(context, "HeightScan", self.robot, self.bodies, self.sites)
-        return HeightScanSensor(self, places, context)
-
-
-class HeightScanSensor:
-    """:class:`HeightScan` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    Args:
-        declaration: The declared scan.
-        places: Its frames.
-        context: The worlds.
-
-    Attributes:
-        names: Name of each point: body or site, and its position in the pattern [m].
-    """
-
-    needs_bodies = True
-
-    def __init__(self, declaration: HeightScan, places: list[BodyFrame], context: SensorContext) -> None:
-        pattern = declaration.pattern.points()
-        self.names = tuple(f"{place.name} {x:+.2f} {y:+.2f}" for place in places for x, y in pattern)
-        self._context = context
-        self._shape = (context.worlds.world_count, len(self.names))
-        ground = context.worlds.ground
-        self._terrain = ground.arrays if ground else flat_ground(context.device)
-        offset = wp.transform(declaration.offset, wp.quat_identity())
-        frames = [wp.transform_multiply(place.pose, offset) for place in places]
-        scan = self._scan = _Scan()
-        scan.bodies = wp.array([place.body for place in places], dtype=wp.int32, device=context.device)
-        scan.locals = wp.array(frames, dtype=wp.transform, device=context.device)
-        scan.pattern = wp.array(pattern.astype(np.float32), dtype=wp.vec2, device=context.device)
-        scan.alignment = ALIGNMENTS.index(declaration.alignment)
-        scan.farthest = declaration.max_distance
-        self.arrays = HeightScanArrays()
-        self.arrays.heights = context.array(self._shape, wp.float32)
-        self.arrays.points = context.array(self._shape, wp.vec3)
-
-    def advance(self) -> None:
-        """Measure all worlds."""
-        self._launch(False)
-
-    def settle(self) -> None:
-        """Measure again in worlds that were just reset."""
-        self._launch(True)
-
-    def _launch(self, fresh_only: bool) -> None:
-        wp.launch(
-            _scan,
-            dim=self._shape,
-            inputs=[fresh_only, self._context.episodes, self._context.bodies, self._terrain, self._scan, self.arrays],
-            device=self._context.device,
-        )
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """All measurements: code before the next physics reads them."""
-        return views_of(self.arrays, "heights", "points")
+        return [str(point) for point in range(len(self.places(views)) * len(self.pattern.points()))]

@@ -7,7 +7,7 @@ import warp as wp
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.kinematics import root_pose
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
-from worker.simulation.sensors.places import place_pose
+from worker.simulation.sensors.sensor import place_pose
 from worker.simulation.worlds import WorldArrays
 
 wp.set_module_options({"enable_backward": False})

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
 import warp as wp
 
-from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_arrays import BodyArrays
-from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose, place_velocity
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import (
+    BodyFrame,
+    Sensor,
+    SensorContext,
+    SensorDeclaration,
+    place_pose,
+    place_velocity,
+)
+from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -148,12 +151,40 @@ def _move(bodies: BodyArrays, body: int, local: wp.transform, imu: ImuArrays):
     imu.velocimeter[world] = wp.quat_rotate_inv(turn, linear)
 
 
+class ImuSensor(Sensor):
+    """An :class:`Imu` of some worlds."""
+
+    needs_bodies = True
+    state = ("gyro", "accelerometer", "velocimeter", "rotations")
+
+    def __init__(self, declared: Imu, context: SensorContext) -> None:
+        (self._place,) = declared.places(context.views)
+        super().__init__(context, [self._place.name])
+        solver = self._worlds.solver
+        self._dynamics = _dynamics(solver, self._worlds.timestep)
+        self._chain = wp.array(_chain(self._place, solver), dtype=wp.int32, device=self._device)
+        self.arrays = filled(ImuArrays, self._device, (self._count,))
+
+    def advance(self) -> None:
+        """Measure the present velocities, and the acceleration of the last physics step."""
+        self._move()
+        self._launch(_accelerate, self._count, self._dynamics, self._chain, self._place.pose, self.arrays)
+
+    def settle(self) -> None:
+        """Measure the velocities again; worlds that were just reset are at rest."""
+        self._move()
+        self._launch(_rest, self._count, self._episodes.ages, self._dynamics, self.arrays)
+
+    def _move(self) -> None:
+        self._launch(_move, self._count, self._bodies, self._place.body, self._place.pose, self.arrays)
+
+
 @dataclass(frozen=True)
-class Imu:
+class Imu(SensorDeclaration):
     """Gyro, accelerometer, velocimeter and orientation of a site or body, as MuJoCo's sensors define them.
 
     Attributes:
-        site: The site that carries it. Give this or ``body``.
+        site: The site that carries it, on a body that moves. Give this or ``body``.
         body: The body that carries it, at its origin.
         robot: The robot with that site or body.
     """
@@ -162,80 +193,17 @@ class Imu:
     body: str | None = None
     robot: str = "robot"
     arrays_type: ClassVar[Any] = ImuArrays
-
-    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
-        return place_names(views, "Imu", self.robot, bodies=self.body, sites=self.site)
-
-    def build(self, context: SensorContext) -> ImuSensor:
-        """The sensor of these worlds.
-
-        Raises:
-            ValueError: Neither or both of ``site`` and ``body`` are given, a name matches nothing or several, or its body is fixed to the
-                world.
-        """
-        if (self.site is None) == (self.body is None):
-            raise ValueError("Imu: give either site or body, and not both")
-        place = only_one(find_places(context, "Imu", self.robot, self.body, self.site), "Imu")
-        return ImuSensor(place, context)
+    sensor_type: ClassVar[Any] = ImuSensor
 
 
-class ImuSensor:
-    """An :class:`Imu` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    Args:
-        place: The frame that carries it.
-        context: The worlds.
-
-    Raises:
-        ValueError: It is fixed to the world.
-    """
-
-    needs_bodies = True
-
-    def __init__(self, place: BodyFrame, context: SensorContext) -> None:
-        self.names = (place.name,)
-        self._place, self._bodies, self._device = place, context.bodies, context.device
-        self._episodes: EpisodeArrays = context.episodes
-        worlds = context.worlds
-        self._count = worlds.world_count
-        self._dynamics = _dynamics(worlds.solver, worlds.timestep)
-        self._chain = wp.array(_chain(place, worlds.solver), dtype=wp.int32, device=self._device)
-        self.arrays = ImuArrays()
-        for name in ("gyro", "accelerometer", "velocimeter"):
-            setattr(self.arrays, name, context.array((self._count,), wp.vec3))
-        self.arrays.rotations = context.array((self._count,), wp.quat)
-
-    def advance(self) -> None:
-        """Measure the present velocities, and the acceleration of the last physics step."""
-        self._move()
-        inputs = [self._dynamics, self._chain, self._place.pose, self.arrays]
-        wp.launch(_accelerate, dim=self._count, inputs=inputs, device=self._device)
-
-    def settle(self) -> None:
-        """Measure the velocities again; worlds that were just reset are at rest."""
-        self._move()
-        inputs = [self._episodes.ages, self._dynamics, self.arrays]
-        wp.launch(_rest, dim=self._count, inputs=inputs, device=self._device)
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """All measurements: code before the next physics reads them."""
-        return views_of(self.arrays, "gyro", "accelerometer", "velocimeter", "rotations")
-
-    def _move(self) -> None:
-        inputs = [self._bodies, self._place.body, self._place.pose, self.arrays]
-        wp.launch(_move, dim=self._count, inputs=inputs, device=self._device)
-
-
-def _dynamics(solver: Any, timestep: float) -> _Dynamics:
-    """Views of the solver's own arrays, whose addresses never change."""
-    model, data, dynamics = solver.mjw_model, solver.mjw_data, _Dynamics()
-    dynamics.timestep, dynamics.gravity = timestep, model.opt.gravity
-    for name in ("parentid", "rootid", "jntnum", "dofnum", "dofadr"):
-        setattr(dynamics, f"body_{name}", getattr(model, f"body_{name}"))
+def _dynamics(solver: Any, timestep: float) -> Any:
+    """The :class:`_Dynamics` of a solver: views of its own arrays, whose addresses never change."""
+    model, data = solver.mjw_model, solver.mjw_data
+    parts = ("parentid", "rootid", "jntnum", "dofnum", "dofadr")
+    views = {f"body_{name}": getattr(model, f"body_{name}") for name in parts}
     for name in ("xpos", "xmat", "subtree_com", "cvel", "cdof", "cdof_dot", "qvel", "qacc"):
-        setattr(dynamics, name, getattr(data, name))
-    return dynamics
+        views[name] = getattr(data, name)
+    return filled(_Dynamics, None, timestep=timestep, gravity=model.opt.gravity, **views)
 
 
 def _chain(place: BodyFrame, solver: Any) -> list[int]:

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import newton
-import torch
 import warp as wp
 
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import place_names
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, find_place, view_of
+from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -75,40 +74,32 @@ def _measure(
     momentum.masses[world] = mass
 
 
-@dataclass(frozen=True)
-class AngularMomentum:
-    """Angular momentum of a robot about its centre of mass: MuJoCo's ``subtreeangmom``, ``subtreelinvel`` and ``subtreecom``.
+class MomentumSensor(Sensor):
+    """:class:`AngularMomentum` of some worlds."""
 
-    Attributes:
-        robot: The robot.
-        body: Root of the subtree that counts; None: the whole robot.
-    """
+    needs_bodies = True
+    state = ("angular", "velocities", "centers", "masses")
 
-    robot: str = "robot"
-    body: str | None = None
-    arrays_type: ClassVar[Any] = MomentumArrays
+    def __init__(self, declared: AngularMomentum, context: SensorContext) -> None:
+        super().__init__(context, declared.rows(context.views))
+        view, model = context.views[declared.robot], self._worlds.model
+        columns = list(view.bodies)
+        if declared.body is not None:
+            columns = _outwards(view.bodies[view.body_names.index(self.names[0])], model)
+        self._masses = model.body_mass.reshape((self._count, -1))
+        self._inertias = model.body_inertia.reshape((self._count, -1))
+        if not self._masses.numpy()[:, columns].sum(1).all():
+            raise ValueError(f"AngularMomentum: {self.names[0]} has no mass, so it has no centre of mass")
+        self._columns = wp.array(columns, dtype=wp.int32, device=self._device)
+        self.arrays = filled(MomentumArrays, self._device, (self._count,))
 
-    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each column, of these robots and objects. Raises ValueError where a pattern or a name matches nothing."""
-        return (
-            [self.robot] if self.body is None else place_names(views, "AngularMomentum", self.robot, bodies=self.body)
-        )
+    def advance(self) -> None:
+        """Measure the present momenta."""
+        self._launch(_measure, self._count, self._columns, self._bodies, self._masses, self._inertias, self.arrays)
 
-    def build(self, context: SensorContext) -> MomentumSensor:
-        """The sensor of these worlds.
-
-        Raises:
-            ValueError: A name matches nothing, ``body`` matches several bodies, or the subtree has no mass.
-        """
-        view = context.view(self.robot, "AngularMomentum.robot")
-        if self.body is None:
-            return MomentumSensor(self.robot, list(view.bodies), context)
-        roots = view.find_bodies(self.body)
-        if len(roots) != 1:
-            matches = ", ".join(view.body_names[root] for root in roots)
-            raise ValueError(f"AngularMomentum.body: name one body; the pattern matches {matches}")
-        columns = _outwards(view.bodies[roots[0]], context.worlds.model)
-        return MomentumSensor(view.body_names[roots[0]], columns, context)
+    def settle(self) -> None:
+        """Measure again, since resets moved some worlds."""
+        self.advance()
 
 
 def _outwards(root: int, model: newton.Model) -> list[int]:
@@ -121,44 +112,23 @@ def _outwards(root: int, model: newton.Model) -> list[int]:
     return sorted(found)
 
 
-class MomentumSensor:
-    """:class:`AngularMomentum` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
+@dataclass(frozen=True)
+class AngularMomentum(SensorDeclaration):
+    """Angular momentum of a robot about its centre of mass: MuJoCo's ``subtreeangmom``, ``subtreelinvel`` and ``subtreecom``.
 
-    Args:
-        name: Name of the robot or its part.
-        columns: Columns of its bodies in ``BodyArrays``.
-        context: The worlds.
-
-    Raises:
-        ValueError: The bodies have no mass.
+    Attributes:
+        robot: The robot.
+        body: Root of the subtree that counts; None: the whole robot.
     """
 
-    needs_bodies = True
+    robot: str = "robot"
+    body: str | None = None
+    arrays_type: ClassVar[Any] = MomentumArrays
+    sensor_type: ClassVar[Any] = MomentumSensor
 
-    def __init__(self, name: str, columns: list[int], context: SensorContext) -> None:
-        self.names = (name,)
-        self._bodies, self._device = context.bodies, context.device
-        self._count = context.worlds.world_count
-        model = context.worlds.model
-        self._masses = model.body_mass.reshape((self._count, -1))
-        self._inertias = model.body_inertia.reshape((self._count, -1))
-        if not self._masses.numpy()[:, columns].sum(1).all():
-            raise ValueError(f"AngularMomentum: {name} has no mass, so it has no centre of mass")
-        self._columns = wp.array(columns, dtype=wp.int32, device=self._device)
-        self.arrays = MomentumArrays()
-        for field in ("angular", "velocities", "centers"):
-            setattr(self.arrays, field, context.array((self._count,), wp.vec3))
-        self.arrays.masses = context.array((self._count,), wp.float32)
-
-    def advance(self) -> None:
-        """Measure the present momenta."""
-        inputs = [self._columns, self._bodies, self._masses, self._inertias, self.arrays]
-        wp.launch(_measure, dim=self._count, inputs=inputs, device=self._device)
-
-    def settle(self) -> None:
-        """Measure again, since resets moved some worlds."""
-        self.advance()
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """All measurements: code before the next physics reads them."""
-        return views_of(self.arrays, "angular", "velocities", "centers", "masses")
+    def rows(self, views: Mapping[str, RobotView]) -> list[str]:
+        """Name of the robot or of the subtree's root. Raises ValueError where a name matches nothing, or ``body`` several."""
+        view_of(views, self.robot, "AngularMomentum.robot")
+        if self.body is None:
+            return [self.robot]
+        return [find_place(views, "AngularMomentum.body", self.robot, self.body, None).name]

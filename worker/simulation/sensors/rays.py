@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import torch
 import warp as wp
 
 from worker.simulation.kinematics import yaw_quaternion
@@ -16,8 +15,8 @@ from worker.simulation.rendering import renderer
 from worker.simulation.robot_arrays import BodyArrays
 from worker.simulation.robot_view import RobotView
 from worker.simulation.sensors.height_scan import ALIGNMENTS, FEW_POINTS, GridPattern, RingPattern
-from worker.simulation.sensors.places import BodyFrame, find_places, only_one, place_names, place_pose
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_pose
+from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -98,8 +97,40 @@ class LidarPattern:
         return np.zeros_like(directions), directions
 
 
+class RayCasting(Sensor):
+    """:class:`RayCaster` of some worlds.
+
+    It measures in :meth:`settle` alone, once a control step. Before that ``Worlds.update_bodies`` and ``Worlds.update_shapes`` must
+    have been called.
+    """
+
+    state = ("distances",)
+
+    def __init__(self, declared: RayCaster, context: SensorContext) -> None:
+        super().__init__(context, declared.rows(context.views))
+        (place,) = declared.places(context.views)
+        mount = wp.transform(wp.vec3(*declared.position), wp.quat_identity())
+        self._frame = (place.body, wp.transform_multiply(place.pose, mount), ALIGNMENTS.index(declared.alignment))
+        self._farthest = declared.max_distance
+        origins, directions = (each.astype(np.float32) for each in declared.rays())
+        self.arrays = filled(RayArrays, self._device, (self._count, len(origins)), directions=directions)
+        self._sensor = renderer(self._worlds.model, 1)
+        # one row of pixels, each with a ray of its own
+        self._rays = wp.array(
+            np.stack((origins, directions), axis=1)[None, :, None], dtype=wp.vec3f, device=self._device
+        )
+        self._poses = context.array((self._count,), wp.transform)
+        self._pixels = context.array((self._count, 1, len(origins)), wp.float32)
+
+    def settle(self) -> None:
+        """Cast the rays of every world."""
+        self._launch(_follow, self._count, self._bodies, *self._frame, self._poses)
+        self._sensor.update(self._worlds.state, self._poses, self._rays, depth_image=self._pixels)
+        self._launch(_measure, self.arrays.distances.shape, self._farthest, self._pixels, self.arrays)
+
+
 @dataclass(frozen=True)
-class RayCaster:
+class RayCaster(SensorDeclaration):
     """Distances along rays to everything that cameras see: the ground, terrain, objects and robots, including its own.
 
     Attributes:
@@ -122,6 +153,7 @@ class RayCaster:
     start: float = 0.0
     max_distance: float = 10.0
     arrays_type: ClassVar[Any] = RayArrays
+    sensor_type: ClassVar[Any] = RayCasting
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """Name of each ray, of these robots and objects. Raises ValueError where a name matches nothing or a number is out of range."""
@@ -129,11 +161,9 @@ class RayCaster:
             raise ValueError(f"RayCaster.alignment is {self.alignment!r}; use one of {', '.join(ALIGNMENTS)}")
         for name, least in (("max_distance", 1e-9), ("start", 0.0)):
             if not least <= getattr(self, name) < math.inf:
-                wanted = "> 0" if least else ">= 0"
-                raise ValueError(f"RayCaster.{name} is {getattr(self, name)}; use a number of metres {wanted}")
-        if (self.body is None) == (self.site is None):
-            raise ValueError("RayCaster: give either body or site, and not both")
-        place_names(views, "RayCaster", self.robot, bodies=self.body, sites=self.site)
+                bound = "> 0" if least else ">= 0"
+                raise ValueError(f"RayCaster.{name} is {getattr(self, name)}; use a number of metres {bound}")
+        self.places(views)
         return [str(ray) for ray in range(len(self.rays()[0]))]
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:
@@ -149,61 +179,3 @@ class RayCaster:
             origins = np.concatenate((points, np.zeros((len(points), 1))), axis=-1)
             directions = np.tile((0.0, 0.0, -1.0), (len(points), 1))
         return origins + self.start * directions, directions
-
-    def build(self, context: SensorContext) -> RayCasting:
-        """The rays of these worlds.
-
-        Raises:
-            ValueError: Neither or both of ``body`` and ``site`` are given, it matches none or several, or a number is out of range.
-        """
-        self.rows(context.views)
-        found = find_places(context, "RayCaster", self.robot, self.body, self.site)
-        return RayCasting(self, only_one(found, "RayCaster"), context)
-
-
-class RayCasting:
-    """:class:`RayCaster` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    It measures in :meth:`settle` alone, once a control step. Before that ``Worlds.update_bodies`` and ``Worlds.update_shapes`` must
-    have been called.
-
-    Args:
-        declared: As a task declares it.
-        place: The body or site that carries the rays' frame.
-        context: The worlds.
-    """
-
-    needs_bodies = False  # only after resets, where the task sees to it
-
-    def __init__(self, declared: RayCaster, place: BodyFrame, context: SensorContext) -> None:
-        self.names = tuple(declared.rows(context.views))
-        self._worlds, self._bodies, self._device = context.worlds, context.bodies, context.device
-        mount = wp.transform(wp.vec3(*declared.position), wp.quat_identity())
-        self._frame = [place.body, wp.transform_multiply(place.pose, mount), ALIGNMENTS.index(declared.alignment)]
-        self._farthest = declared.max_distance
-        origins, directions = declared.rays()
-        count, rays = context.worlds.world_count, len(origins)
-        self.arrays = RayArrays()
-        self.arrays.distances = context.array((count, rays), wp.float32)
-        self.arrays.directions = wp.array(directions.astype(np.float32), dtype=wp.vec3, device=self._device)
-        self._sensor = renderer(context.worlds.model, 1)
-        # one row of pixels, each with a ray of its own
-        bundle = np.stack((origins, directions), axis=1).astype(np.float32)[None, :, None]
-        self._rays = wp.array(bundle, dtype=wp.vec3f, device=self._device)
-        self._poses = context.array((count,), wp.transform)
-        self._pixels = context.array((count, 1, rays), wp.float32)
-
-    def advance(self) -> None:
-        """No-op: rays are cast once per step, after resets."""
-
-    def settle(self) -> None:
-        """Cast the rays of every world."""
-        count, device = self._poses.shape, self._device
-        wp.launch(_follow, dim=count, inputs=[self._bodies, *self._frame, self._poses], device=device)
-        self._sensor.update(self._worlds.state, self._poses, self._rays, depth_image=self._pixels)
-        inputs = [self._farthest, self._pixels, self.arrays]
-        wp.launch(_measure, dim=self.arrays.distances.shape, inputs=inputs, device=device)
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """The latest distances, which rewards of the next step read."""
-        return views_of(self.arrays, "distances")

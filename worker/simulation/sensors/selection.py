@@ -6,13 +6,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
 import warp as wp
 
 from worker.simulation.patterns import find
 from worker.simulation.robot_arrays import RobotArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration
+from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -34,7 +34,7 @@ class SelectionArrays:
 
 @wp.func
 def object_at(objects: SelectionArrays, index: int) -> RobotArrays:
-    """An object by its column; only its root is told."""
+    """An object by its column; only its root is set."""
     found = RobotArrays()
     found.root_coordinate = objects.coordinates[index]
     found.root_dof = objects.dofs[index]
@@ -43,7 +43,7 @@ def object_at(objects: SelectionArrays, index: int) -> RobotArrays:
 
 @wp.func
 def chosen_one(objects: SelectionArrays, world: int) -> RobotArrays:
-    """The object that counts; only its root is told."""
+    """The object that counts; only its root is set."""
     chosen = objects.coordinates.shape[0] - 1
     for index in range(chosen):
         if objects.chosen[world, index] > 0.5:
@@ -51,8 +51,20 @@ def chosen_one(objects: SelectionArrays, world: int) -> RobotArrays:
     return object_at(objects, chosen)
 
 
+class Selection(Sensor):
+    """:class:`ObjectSelection` of some worlds; the command of a new episode selects the object."""
+
+    state = ("chosen",)
+
+    def __init__(self, declared: ObjectSelection, context: SensorContext) -> None:
+        super().__init__(context, declared.rows(context.views))
+        views = [context.views[name] for name in self.names]
+        columns = {"coordinates": [v.root_coordinate for v in views], "dofs": [v.root_dof for v in views]}
+        self.arrays = filled(SelectionArrays, self._device, (self._count, len(views)), **columns)
+
+
 @dataclass(frozen=True)
-class ObjectSelection:
+class ObjectSelection(SensorDeclaration):
     """Objects from which a command selects one: ``terms.lift_one_command`` draws it, and ``terms.chosen_object_...`` read it.
 
     Attributes:
@@ -61,49 +73,13 @@ class ObjectSelection:
 
     objects: str | Sequence[str]
     arrays_type: ClassVar[Any] = SelectionArrays
+    sensor_type: ClassVar[Any] = Selection
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
-        """Name of each object.
-
-        Raises:
-            ValueError: A pattern matches nothing, or an object that is fixed to the world.
-        """
+        """Name of each object. Raises ValueError where a pattern matches nothing, or an object that is fixed to the world."""
         names = [*views]
         found = [names[index] for index in find(names, self.objects, "object")]
         for name in found:
             if views[name].root_coordinate < 0:
                 raise ValueError(f"ObjectSelection: {name} is fixed to the world; leave it out")
         return found
-
-    def build(self, context: SensorContext) -> Selection:
-        """The selection of these worlds. Raises ValueError as :meth:`rows`."""
-        return Selection(self.rows(context.views), context)
-
-
-class Selection:
-    """:class:`ObjectSelection` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    Args:
-        names: Names of the objects.
-        context: The worlds.
-    """
-
-    needs_bodies = False
-
-    def __init__(self, names: list[str], context: SensorContext) -> None:
-        self.names = tuple(names)
-        self.arrays = SelectionArrays()
-        self.arrays.chosen = context.array((context.worlds.world_count, len(names)), wp.float32)
-        for field, own in (("coordinates", "root_coordinate"), ("dofs", "root_dof")):
-            columns = [getattr(context.views[name], own) for name in names]
-            setattr(self.arrays, field, wp.array(columns, dtype=wp.int32, device=context.device))
-
-    def advance(self) -> None:
-        """No-op: nothing is measured."""
-
-    def settle(self) -> None:
-        """No-op: the command of a new episode selects the object."""
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Which object counts."""
-        return views_of(self.arrays, "chosen")

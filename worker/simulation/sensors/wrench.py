@@ -7,13 +7,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-import torch
 import warp as wp
 
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot_view import RobotView
-from worker.simulation.sensors.places import place_names
-from worker.simulation.sensors.sensor import SensorContext, views_of
+from worker.simulation.sensors.sensor import Sensor, SensorContext, SensorDeclaration, place_names
+from worker.simulation.structs import filled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -65,8 +64,33 @@ def _end_with_the_episode(episodes: EpisodeArrays, wrench: WrenchArrays):
         end_wrenches(wrench, world)
 
 
+class WrenchKeeper(Sensor):
+    """:class:`ExternalWrench` of some worlds."""
+
+    state = ("wrenches", "left")
+
+    def __init__(self, declared: ExternalWrench, context: SensorContext) -> None:
+        super().__init__(context, declared.rows(context.views))
+        view = context.views[declared.robot]
+        columns = [view.bodies[each] for each in view.find_bodies(declared.bodies)]
+        for name, column in zip(self.names, columns, strict=True):
+            if column in self._worlds.pushed:
+                raise ValueError(f"ExternalWrench.bodies: {name} is pushed by another ExternalWrench already")
+        self._worlds.pushed.update(columns)
+        wrenches = self._worlds.state.body_f.reshape((self._count, -1))
+        self.arrays = filled(WrenchArrays, self._device, (self._count,), wrenches=wrenches, bodies=columns)
+
+    def advance(self) -> None:
+        """After a control step: end wrenches whose duration is over."""
+        self._launch(_pass_time, self._count, 1.0 / self._context.control_hz, self.arrays)
+
+    def settle(self) -> None:
+        """End the wrenches of the previous episode."""
+        self._launch(_end_with_the_episode, self._count, self._episodes, self.arrays)
+
+
 @dataclass(frozen=True)
-class ExternalWrench:
+class ExternalWrench(SensorDeclaration):
     """Forces and torques on bodies, which ``terms.apply_wrench`` and ``terms.apply_impulse`` draw. They end with the episode.
 
     Attributes:
@@ -77,57 +101,8 @@ class ExternalWrench:
     bodies: str | Sequence[str]
     robot: str = "robot"
     arrays_type: ClassVar[Any] = WrenchArrays
+    sensor_type: ClassVar[Any] = WrenchKeeper
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """Name of each body that is pushed. Raises ValueError where a pattern or a name matches nothing."""
         return place_names(views, "ExternalWrench", self.robot, bodies=self.bodies)
-
-    def build(self, context: SensorContext) -> WrenchKeeper:
-        """The external wrenches of these worlds.
-
-        Raises:
-            ValueError: A pattern matches nothing, or another declaration pushes one of the bodies.
-        """
-        view = context.view(self.robot, "ExternalWrench.robot")
-        found = view.find_bodies(self.bodies)
-        names = tuple(view.body_names[each] for each in found)
-        columns = [view.bodies[each] for each in found]
-        for name, column in zip(names, columns, strict=True):
-            if column in context.worlds.pushed:
-                raise ValueError(f"ExternalWrench.bodies: {name} is pushed by another ExternalWrench already")
-        context.worlds.pushed.update(columns)
-        return WrenchKeeper(names, columns, context)
-
-
-class WrenchKeeper:
-    """:class:`ExternalWrench` of some worlds; see :class:`worker.simulation.sensors.sensor.Sensor`.
-
-    Args:
-        names: Names of the bodies.
-        columns: Their columns among all bodies of a world.
-        context: The worlds.
-    """
-
-    needs_bodies = False
-
-    def __init__(self, names: tuple[str, ...], columns: list[int], context: SensorContext) -> None:
-        self.names, self._context = names, context
-        self._count = context.worlds.world_count
-        self.arrays = WrenchArrays()
-        self.arrays.wrenches = context.worlds.state.body_f.reshape((self._count, -1))
-        self.arrays.bodies = wp.array(columns, dtype=wp.int32, device=context.device)
-        self.arrays.left = context.array((self._count,), wp.float32)
-
-    def advance(self) -> None:
-        """After a control step: end wrenches whose duration is over."""
-        inputs = [1.0 / self._context.control_hz, self.arrays]
-        wp.launch(_pass_time, dim=self._count, inputs=inputs, device=self._context.device)
-
-    def settle(self) -> None:
-        """End the wrenches of the previous episode."""
-        inputs = [self._context.episodes, self.arrays]
-        wp.launch(_end_with_the_episode, dim=self._count, inputs=inputs, device=self._context.device)
-
-    def state_tensors(self) -> dict[str, torch.Tensor]:
-        """Wrenches for the next physics, and their remaining durations."""
-        return views_of(self.arrays, "wrenches", "left")

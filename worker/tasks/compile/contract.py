@@ -165,7 +165,7 @@ def _movements(
             default_position=0.0,
             offset=value_of(plan, driven.offset, index, 0.0),
             clip=clip,
-            rule=f"{_rule(term)} Then {frame.said(plan.views)}",
+            rule=f"{_rule(term)} Then {frame.description(plan.views)}",
         )
         for index, (name, axis) in enumerate(zip(driven.bound.element_names, frame.axes, strict=False))
     ]

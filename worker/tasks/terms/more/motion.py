@@ -11,7 +11,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from worker.simulation.sensors.places import place_names
+from worker.simulation.sensors.sensor import place_names
 from worker.tasks.terms.more.frame_sampling import AdaptiveSampling, FrameSampling, SamplingArrays
 
 if TYPE_CHECKING:
