@@ -413,7 +413,7 @@ class Engine(Protocol):
         """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left.
 
         Raises EngineError, which is the job's reason until the next try. It never waits for an answer without end: see
-        :func:`orchestrator.engines.toolkit.stopping.stop_within`.
+        :func:`orchestrator.engines.toolkit.waiting.stop_within`.
         """
         ...
 

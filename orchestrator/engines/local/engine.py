@@ -38,10 +38,9 @@ from orchestrator.engines.api import (
 )
 from orchestrator.engines.local import TRAITS
 from orchestrator.engines.local.gangs import parent_of
-from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.environment import inherited
 from orchestrator.engines.toolkit.gpus import visible_gpus
-from orchestrator.engines.toolkit.looks import one_by_one
+from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.contract.node import NodeContract, sealed

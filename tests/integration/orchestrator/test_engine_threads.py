@@ -39,7 +39,7 @@ from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.toolkit.looks import status_of
-from orchestrator.engines.toolkit.stopping import stop_within
+from orchestrator.engines.toolkit.waiting import stop_within
 from orchestrator.engines.transience import is_final
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate

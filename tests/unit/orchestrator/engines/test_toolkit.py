@@ -28,7 +28,7 @@ from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.engines.toolkit.environment import PRIVATE, inherited
 from orchestrator.engines.toolkit.log_copy import LogCopy
 from orchestrator.engines.toolkit.outcomes import all_recorded, log_of, record, recorded, seen, store_facts
-from orchestrator.engines.toolkit.stopping import stop_within
+from orchestrator.engines.toolkit.waiting import stop_within
 from orchestrator.engines.toolkit.view import CachedView, View
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.contract.node import LOG_LIMIT
