@@ -143,18 +143,10 @@ def test_aws_s_exit_code_and_reason_give_the_cause_of_a_node_s_end(
     code: int | None, reason: str, cause: Cause | None
 ) -> None:
     pytest.importorskip("boto3")
-    from orchestrator.engines.aws_batch.node_status import node_ended
+    from orchestrator.engines.aws_batch.watched_gang import node_ended
 
     check_end(node_ended("10.0.0.1", code, reason), cause, code, reason)
     check_end(node_ended("10.0.0.1", None, reason, not_started=True), Cause.CANNOT_START, None, reason)
-
-
-@pytest.mark.parametrize(("status", "phase"), [("RUNNABLE", QUEUED), ("SUBMITTED", QUEUED), ("STARTING", STARTING)])
-def test_a_node_that_aws_has_not_started_is_queued_until_it_has_an_instance(status: str, phase: NodePhase) -> None:
-    pytest.importorskip("boto3")
-    from orchestrator.engines.aws_batch.node_status import waits
-
-    assert waits(status, "", "AWS Batch gets 2 instances") == NodeStatus(phase, words="AWS Batch gets 2 instances")
 
 
 @pytest.mark.parametrize(
