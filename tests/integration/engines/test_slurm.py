@@ -218,7 +218,7 @@ MOUNTED["mountPoints"] = [{"sourceVolume": "v", "containerPath": "/mnt"}]
         ({"cpus": 5}, "Slurm refuses the job: .*Requested node configuration is not available"),
         ({"options": {"nice": "much"}}, "muster:nice is 'much', not a whole number"),
         ({"title": "a\nb"}, "title .* has a control character"),
-        (UNEQUAL, "nodes of one gang are of one size on Slurm, these are not .*64 MiB.*128 MiB"),
+        (UNEQUAL, "Slurm requires identical nodes, these differ .*64 MiB.*128 MiB"),
         ({"containers": [MOUNTED]}, "volume /mnt: the slurm engine mounts nothing"),
     ],
 )

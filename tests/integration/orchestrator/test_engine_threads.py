@@ -106,12 +106,12 @@ def test_an_error_without_a_number_is_not_final() -> None:
 def refused_plan(error: OSError) -> None:
     """Plan a gang on an engine that raises this error."""
     engine = FakeEngine()
-    runner = Runner(engine, lambda _: None)
+    asked = runner.Runner(engine, lambda _: None)
     engine.plan = lambda gang: (_ for _ in ()).throw(error)  # type: ignore[method-assign]
     try:
-        runner.plan(make_gang(Path("/")))
+        asked.plan(make_gang(Path("/")))
     finally:
-        runner.close()
+        asked.close()
 
 
 def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
