@@ -227,13 +227,6 @@ def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_d
     assert bench.outcome(2).exit_code == 3 and bench.outcome(1).exit_code == 0
 
 
-def test_a_gang_that_ignores_a_child_s_death_continues(bench: AwsBench) -> None:
-    script = f"[ $NODE_RANK = 1 ] && exit 3; {LAST}; sleep 1; echo done without it"
-    handle = bench.launch(bench.gang(script, 2, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 2))
-    assert bench.ended(handle)[0].exit_code == 0
-    assert bench.log() == ["done without it"] and bench.outcome(1).exit_code == 3
-
-
 def test_an_image_without_muster_runs_as_it_is(bench: AwsBench) -> None:
     handle = bench.launch(bench.gang("echo plain $GREETING $AWS_BATCH_JOB_NODE_INDEX; exit 4", 1, native=False))
     [node] = bench.ended(handle)

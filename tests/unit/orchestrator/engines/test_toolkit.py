@@ -10,7 +10,6 @@ from dataclasses import replace
 from math import inf
 from pathlib import Path
 from queue import SimpleQueue
-from typing import Any
 
 import pytest
 
@@ -155,9 +154,6 @@ def test_an_action_that_fails_at_every_other_try_is_logged_once_and_waits_longer
     assert backoff.worked("job", lasting=True) and not backoff
 
 
-HANDLE = Handle("any", "job/1/1", 1, {"slurm": "7"})
-
-
 def stop(seconds: float, step: Callable[[], str]) -> None:
     stop_within(seconds, step, engine="fake", gang="job/1/1", pause=0.001)
 
@@ -187,34 +183,6 @@ def test_a_stop_that_is_never_answered_ends_with_the_last_answer_and_a_refused_o
         with pytest.raises(kind) as raised:
             stop(0.02, step)
         assert str(raised.value) == words
-
-
-def test_a_slurm_that_never_answers_ends_the_stop(monkeypatch: pytest.MonkeyPatch) -> None:
-    def away(*_: str, **__: Any) -> str:
-        raise slurm.SlurmUnreachable("slurmctld does not answer (connection refused); see `scontrol ping`")
-
-    monkeypatch.setattr("orchestrator.engines.slurm.slurm_commands.call", lambda *_, **__: "")
-    engine = slurm.SlurmEngine()
-    monkeypatch.setattr("orchestrator.engines.slurm.slurm_commands.call", away)
-    monkeypatch.setattr(slurm, "call", away)
-    monkeypatch.setattr(slurm, "_KILLING", 0.05)
-    with pytest.raises(Transient, match=r"^the slurm engine has not ended gang job/1/1 .*: slurmctld does not answer"):
-        engine.stop(HANDLE, 0.0)
-
-
-def test_a_ray_driver_that_never_answers_ends_the_stop(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from orchestrator.engines.ray import engine as ray
-    from orchestrator.engines.ray.folder import Folder
-
-    engine = object.__new__(ray.RayEngine)
-    engine.home = tmp_path
-    folder = Folder.of(tmp_path, "job")
-    folder.make()
-    folder.plan("job/1/1").write_text("{}")
-    monkeypatch.setattr(Folder, "send", lambda *_: True)
-    monkeypatch.setattr(ray, "_ENDING", 0.05)
-    with pytest.raises(Transient, match=r"^the ray engine has not ended gang .*: its driver has reported nothing yet$"):
-        engine.stop(HANDLE, 0.0)
 
 
 class Backend:
