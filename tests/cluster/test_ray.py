@@ -89,7 +89,7 @@ def test_what_the_driver_is_told_is_the_request_of_the_plan(bench: RayBench) -> 
     plan = bench.engine.plan(gang)
     bench.ready(gang)
     told = json.loads(Folder.of(bench.engine.home, gang.job).plan(gang.name).read_bytes())
-    assert told == json.loads(json.dumps(plan.request.told())) and told["nodes"][0]["contract"]["bus_token"]
+    assert told == json.loads(json.dumps(plan.request.document())) and told["nodes"][0]["contract"]["bus_token"]
     for node in told["nodes"]:
         assert f'{{"ray.io/node-id": "{node["pin"]}"}}' in plan.document
     assert "the credential" not in plan.document

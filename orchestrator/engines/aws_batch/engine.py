@@ -155,17 +155,18 @@ class AwsBatchEngine:
 
     def _check_queue(self) -> None:
         """Later AWS may be away for a while, and a gang waits for it; what is wrong from the start would wait for ever."""
-        queue, where = self.config.job_queue, self.config.endpoint_url or self.config.region
+        queue = self.config.job_queue
+        where = f"AWS Batch ({self.config.endpoint_url or self.config.region})"
         try:
             with answered():
                 found = self._batch.describe_job_queues(jobQueues=[queue])["jobQueues"]
         except EngineError as error:
             hint = "region and endpoint_url in aws.json" if isinstance(error, NotYet) else "`aws configure`"
-            words = str(error).removesuffix("; trying again").replace("AWS Batch", f"AWS Batch ({where})", 1)
+            words = str(error).removesuffix("; trying again").replace("AWS Batch", where, 1)
             raise EngineError(f"{words}; see {hint}") from None
         if not found:
             raise EngineError(
-                f"AWS Batch ({where}) has no job queue {queue}; see `muster aws status`, or make it with `muster aws up`"
+                f"{where} has no job queue {queue}; see `muster aws status`, or make it with `muster aws up`"
             )
 
     # -- starting -----------------------------------------------------------------------------------------------------
