@@ -35,13 +35,6 @@ START = 5.0
 """Seconds that a controller's start waits for the first answers of its engines; it goes on without those that are later."""
 
 
-class NotServed(NotYet):
-    """This controller was started without the engine, on which something of the gang may run."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message, unknown=True)
-
-
 class EngineSet:
     """Engines by their names, each on its own thread; the first is the one that jobs of the queue ``default`` go to."""
 
@@ -173,10 +166,9 @@ class EngineSet:
         Of a gang whose engine is not served, or can't look now, nothing new is known: it counts as running.
         """
         found = self._handle(handle)
-        try:
-            return self._runner(found.engine).observe(found)
-        except NotServed as error:
-            return [NodeStatus(NodePhase.UNREACHABLE, words=str(error))] * found.nodes
+        if runner := self._runners.get(found.engine):
+            return runner.observe(found)
+        return [NodeStatus(NodePhase.UNREACHABLE, words=_not_served(found.engine))] * found.nodes
 
     def look(self) -> None:
         """Ask for newer statuses of the gangs that are observed; :attr:`changed` tells of those that differ. Does not wait."""
@@ -214,8 +206,12 @@ class EngineSet:
         try:
             return self._runners[name]
         except KeyError:
-            raise NotServed(f"engine {name} is not served now; start muster serve with --engine {name}") from None
+            raise NotYet(_not_served(name), unknown=True) from None  # something of the gang may run there
 
 
 def _has_secrets(containers: Iterable[Mapping[str, Any]]) -> bool:
     return any(container.get("secrets") for container in containers)
+
+
+def _not_served(name: str) -> str:
+    return f"engine {name} is not served now; start muster serve with --engine {name}"

@@ -80,13 +80,6 @@ class Health:
     """Seconds until the next of these tries; None where none fails."""
 
 
-class Underway(NotYet):
-    """The engine was asked to launch a gang and has not answered yet; the message is empty until it is overdue."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message, unknown=True)
-
-
 @dataclass
 class _Observed:
     """A gang whose status the controller needs."""
@@ -194,7 +187,10 @@ class Runner:
         return self._call("plan the gang", lambda: self.engine.plan(gang), lasting=True)
 
     def launch(self, gang: str, plan: Callable[[], Plan[Any]], again: bool = True) -> Handle:
-        """The handle of the gang of that name once it is started. Raises :class:`Underway` until then, NotYet and EngineError.
+        """The handle of the gang of that name once it is started. Raises NotYet until then, and EngineError.
+
+        While the launch is under way, the message is empty until it is overdue.
+
 
         ``plan`` is called, on the caller's thread, where the gang's launch is not under way.
         ``again``: whether to try again where the last try has left nothing of the gang.
@@ -214,7 +210,7 @@ class Runner:
             launch = self._launches[gang] = self._submit(lambda: self._start(planned), self._launching)
             launch.add_done_callback(lambda _: self._changed(gang))
         if not launch.done():
-            raise Underway(self._any_silence or "")
+            raise NotYet(self._any_silence or "", unknown=True)
         try:
             return launch.result()  # again and again: the caller may not be able to record it
         except EngineError as error:

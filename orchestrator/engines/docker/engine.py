@@ -46,7 +46,7 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.docker import TRAITS
-from orchestrator.engines.docker.answers import NoAnswer, answered, unanswered
+from orchestrator.engines.docker.answers import answered, unanswered
 from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
 from orchestrator.engines.toolkit.gpus import visible_gpus
@@ -138,7 +138,7 @@ class DockerEngine:
         try:
             with answered():
                 listed = self._listed()
-        except NoAnswer as error:
+        except NotYet as error:
             if not self._away:  # said once, not at every look
                 log.warning("engine docker: %s", error)
             self._away = True

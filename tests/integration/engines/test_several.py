@@ -361,7 +361,7 @@ def test_a_missing_configuration_of_slurm_is_reported_as_such(tmp_path: Path, mo
     assert bad.returncode == 1
     assert "Slurm is installed but has no configuration here: put the cluster's slurm.conf at /etc/slurm/" in bad.stdout
     bad = call_muster("doctor", "--engine", "slurm", home=tmp_path, SLURM_CONF="/no/slurm.conf")
-    assert "SLURM_CONF is /no/slurm.conf, which is not there; set it to the cluster's slurm.conf" in bad.stdout
+    assert "SLURM_CONF is /no/slurm.conf, which does not exist; set it to the cluster's slurm.conf" in bad.stdout
 
 
 @pytest.mark.parametrize("engine", ["local", "ray"])
