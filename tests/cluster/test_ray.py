@@ -141,18 +141,6 @@ def test_a_node_with_another_volume_at_the_store_s_path_is_named_and_nothing_run
     assert bench.lines() == [] and read_outcome(bench.run, bench.job, 1, 0) is None
 
 
-def test_a_controller_that_starts_again_finds_the_gang(bench: RayBench) -> None:
-    gang = bench.gang()
-    handle = bench.ready(gang)
-    driver, seen = bench.driver(), status_of(bench.engine, handle)
-    bench.engine.close()
-    bench.engine = bench.new_engine()
-    assert status_of(bench.engine, handle) == seen
-    assert bench.engine.launch(bench.engine.plan(gang)) == handle and bench.driver() == driver
-    assert bench.log().count("ready") == 3, "found, not started twice"
-    assert bench.stopped(handle) == [143, 143, 143]
-
-
 @pytest.mark.parametrize("killed", ["actor", "shim"])
 def test_an_actor_or_a_shim_that_is_killed_takes_what_its_rank_started_with_it(bench: RayBench, killed: str) -> None:
     script = f"[ $NODE_RANK = 0 ] || {{ setsid sleep 577 & echo $! > $MUSTER_STORE/apart; }}; echo $PPID > $MUSTER_STORE/supervisor-$NODE_RANK; {WAIT}"

@@ -192,9 +192,9 @@ class DockerEngine:
     def _launch(self, plan: Plan[Sequence[ContainerRequest]]) -> Handle:
         gang = plan.gang
         images = [self._image(request.image) for request in plan.request]
-        there = self._containers(gang.name)
+        existing = self._containers(gang.name)
         for index, (image, command) in enumerate(zip(images, gang.commands, strict=True)):
-            if index not in there:
+            if index not in existing:
                 _check_image(plan.request[index].image, image, command)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
@@ -203,9 +203,9 @@ class DockerEngine:
         handle = Handle(self.name, gang.name, len(requests), {**store_facts(gang), "addresses": addresses})
         try:
             for index in sorted(range(len(requests)), key=lambda index: index != gang.main):
-                if index in there:
-                    if there[index].status == "created":  # the controller was killed between the two
-                        there[index].start()
+                if index in existing:
+                    if existing[index].status == "created":  # the controller was killed between the two
+                        existing[index].start()
                 elif read_outcome(run, gang.job, gang.attempt, index) is None:
                     container = self._create(requests[index], images[index], network)
                     container.start()

@@ -51,7 +51,7 @@ class ContainerRequest:
             default: Its ``CMD``, for a job that has no command. Docker takes it by itself only where it is told no entrypoint either.
             kernels: Directory for compiled kernels; None for an image without Muster, whose command runs without a supervisor.
         """
-        told = self.contract.to_env()
+        contract = self.contract.to_env()
         own = list(self.command or default)
         node = str(self.contract.node_index)
         arguments: dict[str, Any] = {
@@ -61,12 +61,12 @@ class ContainerRequest:
             **self.options,
         }
         if kernels is None:
-            environment = {**self.environment, **told}
+            environment = {**self.environment, **contract}
             environment = {name: value for name, value in environment.items() if name not in BUS_VARIABLES}
             mounts, entry, command = [*self.mounts], list(entrypoint) or None, own
         else:
             job = {"HOME": "/tmp", "WARP_CACHE_PATH": KERNELS, **self.environment}
-            environment = {"HOME": "/tmp", **sealed_in_image(job, told)}
+            environment = {"HOME": "/tmp", **sealed_in_image(job, contract)}
             mounts = [*self.mounts, Mount(STORE, self.store, "bind"), Mount(KERNELS, str(kernels), "bind")]
             # whoever owns the store writes it; that is seldom the user that the image names
             owner = Path(self.store).stat()

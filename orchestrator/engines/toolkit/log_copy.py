@@ -26,8 +26,8 @@ class LogCopy:
 
     def append(self, lines: Iterable[str]) -> None:
         """Add lines with their ends, from the first that was ever copied on. Raises OSError: they are kept, :meth:`flush` tries again."""
-        given = list(lines)
-        fresh, self._skip = given[self._skip :], max(0, self._skip - len(given))
+        lines = list(lines)
+        fresh, self._skip = lines[self._skip :], max(0, self._skip - len(lines))
         self._pending += "".join(fresh).encode(errors="backslashreplace")
         self.flush()
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import socket
-import tarfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -270,40 +268,6 @@ def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_
     said = f"image {old} has Muster 0.0.1, the controller {__version__}"
     assert str(refused.value) == f"{said}: build it anew with the controller's version"
     assert bench.left() == (0, 0)
-
-
-OWN = ('ENTRYPOINT ["echo", "entrypoint"]', 'CMD ["of", "the image"]')
-SHELL = ("ENTRYPOINT exec sh -c 'echo entrypoint of the shell'",)
-
-
-@pytest.mark.parametrize("labels", [(), (f"LABEL muster.version={__version__}",)], ids=["plain", "supervised"])
-@pytest.mark.parametrize(
-    ("own", "command", "line"),
-    [
-        (OWN, (), "entrypoint of the image"),
-        (OWN, ("of", "the job"), "entrypoint of the job"),
-        (OWN[:1], (), "entrypoint"),
-        (('CMD ["echo", "command alone"]',), (), "command alone"),
-        (SHELL, (), "entrypoint of the shell"),
-    ],
-)
-def test_a_job_without_a_command_runs_that_of_its_image(
-    bench: DockerBench, labels: tuple[str, ...], own: tuple[str, ...], command: tuple[str, ...], line: str
-) -> None:
-    """As Docker runs it by itself; each node of a gang the same."""
-    image = f"muster-test-own-{bench.job}"
-    empty = io.BytesIO()
-    with tarfile.open(fileobj=empty, mode="w"):
-        pass
-    changes = [*own, *labels]
-    bench.client.api.import_image_from_data(empty.getvalue(), repository=image, tag="1", changes=changes)
-    try:
-        handle = bench.launch(bench.gang(nodes=2, image=f"{image}:1", commands=[command] * 2))
-        assert [node.exit_code for node in bench.ended(handle)] == [0, 0], bench.log()
-        assert bench.log() == [line, line]
-        bench.stopped(handle)
-    finally:
-        bench.client.images.remove(f"{image}:1", force=True)
 
 
 def test_an_image_that_has_no_command_either_is_refused(bench: DockerBench) -> None:
