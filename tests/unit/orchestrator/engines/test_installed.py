@@ -29,7 +29,9 @@ DOCUMENTATION = Path(__file__).parents[4] / "docs"
 def test_muster_s_own_engines_are_entry_points_and_any_other_is_refused_with_those_that_are() -> None:
     assert ENGINES[:5] == ("local", "docker", "ray", "slurm", "aws-batch")
     assert all(isinstance(engine_type(name), EngineType) for name in ENGINES)
-    with pytest.raises(EngineError, match="there is no engine 'kubernetes'; available: local, docker, ray, slurm, aws-"):
+    with pytest.raises(
+        EngineError, match="there is no engine 'kubernetes'; available: local, docker, ray, slurm, aws-"
+    ):
         engine_type("kubernetes")
 
 
