@@ -105,7 +105,9 @@ class WatchedGang:
         reason = str(container.get("reason") or ("" if code == 0 else detail.get("statusReason") or ""))
         if code is not None:
             stopped = float(detail.get("stoppedAt") or time.time() * 1000)
-            outcome = seen(self.handle, index, code, reason, stopped / 1000, 0 < main_stopped < stopped)
+            outcome = seen(
+                self.handle, index, code, reason, stopped / 1000, 0 < main_stopped < (detail.get("stoppedAt") or 0)
+            )
             if not self._settled(log, outcome):
                 return NodeStatus(NodePhase.RUNNING, address)  # it has ended, but how is still on its way
         return node_ended(address, code, reason, code is None and detail.get("statusReason") == AWS_NOT_STARTED)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -93,10 +93,10 @@ def test_a_copied_log_has_each_line_once_whoever_copies(handle: Handle) -> None:
     path, limit = log_of(handle, 0)
     assert limit == LOG_LIMIT
     lines = [f"line {number} \udcff\n" for number in range(7)]
-    with LogCopy(path, limit) as copy:
+    with closing(LogCopy(path, limit)) as copy:
         copy.append(lines[:3])
         copy.append(lines[3:4])
-    with LogCopy(path, limit) as copy:  # by a controller that starts from the beginning, in other pieces
+    with closing(LogCopy(path, limit)) as copy:  # by a controller that starts from the beginning, in other pieces
         copy.append(lines[:2])
         copy.append(lines[2:6])
         copy.append(lines[6:])
@@ -115,7 +115,7 @@ def test_lines_for_which_there_was_no_room_are_written_later(handle: Handle, mon
             return written
 
     monkeypatch.setattr(log_copy, "LogWriter", Full)
-    with LogCopy(path, limit) as copy:
+    with closing(LogCopy(path, limit)) as copy:
         with pytest.raises(OSError, match="No space left"):
             copy.append(["a\n", "b\n", "c\n"])
         assert not copy.is_whole and path.read_text() == "a\nb\n"
