@@ -87,6 +87,8 @@ def keep_old_names(names: Mapping[str, str], members: Mapping[str, str] | None =
 
 
 OLD_NAMES = {
+    "orchestrator.engines.toolkit.endings": "orchestrator.engines.toolkit.looks",
+    "orchestrator.engines.toolkit.stopping": "orchestrator.engines.toolkit.waiting",
     "shared_store.cgroups": "shared_store.process.cgroups",
     "shared_store.checkpoints": "shared_store.volume.checkpoints",
     "shared_store.file_fields": "shared_store.contract.file_fields",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -15,7 +15,7 @@ from shared_store.contract.node import LOG_LIMIT, NodeContract
 
 
 class EngineError(Exception):
-    """The engine can't do what was asked; the message is the reason that the job is given."""
+    """The engine can't do it; the message is the job's reason."""
 
 
 class CannotStart(EngineError):
@@ -32,7 +32,7 @@ class NotYet(EngineError):
 
 
 class Transient(NotYet):
-    """The operating system or a volume failed in a way that may pass: no descriptors, processes or space, a volume that is away."""
+    """The operating system or a volume failed in a way that may pass: no descriptors, processes or space, an unreachable volume."""
 
 
 class EngineFault(Transient):
@@ -125,33 +125,18 @@ class Plan(Generic[Request]):
 
 def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan]:
     """The plan of each node of ``gang``, where node ``i`` has ``addresses[i]`` and all meet at the main node's ``port``."""
+    shared = {each.name: getattr(gang, each.name) for each in fields(NodeContract) if hasattr(gang, each.name)}
+    shared |= {"node_count": len(gang.placements), "main_index": gang.main}
+    shared |= {"master_address": addresses[gang.main], "master_port": port}
     plans = []
     for index, placement in enumerate(gang.placements):
         contract = NodeContract(
-            job=gang.job,
-            attempt=gang.attempt,
+            **shared,
             node_index=index,
-            node_count=len(gang.placements),
-            main_index=gang.main,
-            master_address=addresses[gang.main],
-            master_port=port,
-            run=gang.run,
-            store=gang.store,
-            epoch=gang.epoch,
-            job_epoch=gang.job_epoch,
             ranks_per_node=gang.ranks[index] if gang.ranks else 1,
-            grace=gang.grace,
-            queue=gang.queue,
-            compute_environment=gang.compute_environment,
-            is_gang=gang.is_gang,
-            array=gang.array,
             isolation=_isolation(gang, index),
             cpus=placement.cpus,
-            stall_timeout=gang.stall_timeout,
-            log_limit=gang.log_limit,
             address=addresses[index],
-            bus=gang.bus,
-            bus_token=gang.bus_token,
             note=gang.notes[index] if gang.notes else "",
         )
         plans.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
@@ -192,14 +177,13 @@ def read_handle(text: str) -> Handle:
     """The handle that the database keeps as ``text``, also one of Muster 0.1. Raises ValueError for anything else."""
     try:
         if text.startswith("{"):
-            told = json.loads(text)
-            return Handle(str(told["engine"]), str(told["gang"]), int(told["nodes"]), dict(told["facts"]))
-        engine, nodes, rest = text.split(
-            " ", 2
-        )  # until then: the engine, the number of nodes, and JSON of the engine's own
+            document = json.loads(text)
+            return Handle(
+                str(document["engine"]), str(document["gang"]), int(document["nodes"]), dict(document["facts"])
+            )
+        engine, nodes, rest = text.split(" ", 2)  # of 0.1: the third is JSON of the engine's own
         facts = json.loads(rest)
-        gang = facts.pop("gang" if "gang" in facts else "ray")
-        return Handle(engine, str(gang), int(nodes), facts)
+        return Handle(engine, str(facts.pop("gang" if "gang" in facts else "ray")), int(nodes), facts)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"the handle of a gang is damaged ({error}): {text[:200]!r}") from error
 
@@ -413,7 +397,7 @@ class Engine(Protocol):
         """SIGTERM, ``grace`` seconds later SIGKILL; returns when no process of the gang is left.
 
         Raises EngineError, which is the job's reason until the next try. It never waits for an answer without end: see
-        :func:`orchestrator.engines.toolkit.stopping.stop_within`.
+        :func:`orchestrator.engines.toolkit.waiting.stop_within`.
         """
         ...
 

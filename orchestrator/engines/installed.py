@@ -40,8 +40,8 @@ ENGINES = tuple(_POINTS)
 def engine_type(name: str) -> EngineType:
     """The engine's type. Raises EngineError where there is none of this name, two packages give it, or it can't be imported."""
     if name not in _POINTS:
-        there = ", ".join(ENGINES) or "none: install Muster again (pip install -e .)"
-        raise EngineError(f"there is no engine {name!r}; there are {there}")
+        available = ", ".join(ENGINES) or "none: install Muster again (pip install -e .)"
+        raise EngineError(f"there is no engine {name!r}; available: {available}")
     if words := clash(entry_points(group=GROUP), name):
         raise EngineError(f"engine {name}: {words}")
     try:
@@ -49,7 +49,7 @@ def engine_type(name: str) -> EngineType:
     except (ImportError, AttributeError) as error:
         raise EngineError(f"engine {name}: {_POINTS[name].value} can't be imported: {error}") from error
     if not isinstance(found, EngineType):
-        raise EngineError(f"engine {name}: {_POINTS[name].value} is no EngineType (orchestrator.engines.api)")
+        raise EngineError(f"engine {name}: {_POINTS[name].value} is not an EngineType (orchestrator.engines.api)")
     return found
 
 

@@ -35,13 +35,6 @@ START = 5.0
 """Seconds that a controller's start waits for the first answers of its engines; it goes on without those that are later."""
 
 
-class NotServed(NotYet):
-    """This controller was started without the engine, on which something of the gang may run."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message, unknown=True)
-
-
 class EngineSet:
     """Engines by their names, each on its own thread; the first is the one that jobs of the queue ``default`` go to."""
 
@@ -104,24 +97,22 @@ class EngineSet:
     def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it. Raises EngineError, also where an image is named that it would not run and must not pass over."""
         runner = self._runner(engine_of(gang.placements[0].host))
-        engine = runner.engine
-        traits = engine.traits
+        engine, traits = runner.engine, runner.engine.traits
+        name = f"the {engine.name} engine"
         if not traits.images and not all(gang.commands):
+            raise EngineError(f"the job has no command, and {name} runs no image that could have one; give it one")
+        images = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
+        if images and not traits.images and gang.options.get("images") == "refuse":
             raise EngineError(
-                f"the job has no command, and the {engine.name} engine runs no image that could have one; give it one"
-            )
-        named = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
-        if named and not traits.images and gang.options.get("images") == "refuse":
-            raise EngineError(
-                f"image {min(named)}: the {engine.name} engine runs commands in its nodes' own environment, and compute environment "
+                f"image {min(images)}: {name} runs commands in its nodes' own environment, and compute environment "
                 f"{gang.compute_environment} refuses other images (tag muster:images)"
             )
-        if any(container.get("secrets") for container in gang.containers) and traits.secrets is SecretValues.NONE:
-            raise EngineError(f"secrets: the {engine.name} engine has no safe way to hand them to its nodes")
+        if _has_secrets(gang.containers) and traits.secrets is SecretValues.NONE:
+            raise EngineError(f"secrets: {name} has no safe way to hand them to its nodes")
         if traits.images:  # its containers are what others have to imitate
             gang = replace(gang, isolated=False)
         elif not traits.users:
-            why = f"the {engine.name} engine runs jobs as the user of its nodes"
+            why = f"{name} runs jobs as the user of its nodes"
             users = [container.get("user") for container in gang.containers]
             unused = [unused_user(user, why) if user else "" for user in users]
             before = gang.notes or [""] * len(unused)
@@ -135,19 +126,17 @@ class EngineSet:
 
         Raises EngineError.
         """
-        if not any(container.get("secrets") for container in gang.containers):
-            return gang
-        if self._traits(engine_of(gang.placements[0].host)).secrets is not SecretValues.ENVIRONMENT:
+        way = self._traits(engine_of(gang.placements[0].host)).secrets
+        if way is not SecretValues.ENVIRONMENT or not _has_secrets(gang.containers):
             return gang
         try:
-            given = [self.secrets.of(container, gang.queue) for container in gang.containers]
+            values = [self.secrets.of(container, gang.queue) for container in gang.containers]
         except SecretsError as error:
             raise EngineError(str(error)) from None
-        environments = [{**told, **more} for told, more in zip(gang.environments, given, strict=True)]
-        return replace(gang, environments=environments)
+        return replace(gang, environments=[{**a, **b} for a, b in zip(gang.environments, values, strict=True)])
 
     def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]], queue: str) -> None:
-        """Raises SecretsError where a job of this queue on one of these engines could not be given the secrets that it asks for."""
+        """Raises SecretsError where a job of this queue on one of these engines can't have the secrets that it requests."""
         if any(self._traits(name).secrets is not SecretValues.REFERENCES for name in names):
             self.secrets.check(containers, queue)
 
@@ -172,15 +161,14 @@ class EngineSet:
         return inf if runner is None else runner.launch_pause(gang)
 
     def observe(self, handle: str) -> GangStatus | None:
-        """The newest picture of a gang; None before the first. Does not wait, and raises nothing.
+        """The newest status of a gang; None before the first. Does not wait, and raises nothing.
 
         Of a gang whose engine is not served, or can't look now, nothing new is known: it counts as running.
         """
         found = self._handle(handle)
-        try:
-            return self._runner(found.engine).observe(found)
-        except NotServed as error:
-            return [NodeStatus(NodePhase.UNREACHABLE, words=str(error))] * found.nodes
+        if runner := self._runners.get(found.engine):
+            return runner.observe(found)
+        return [NodeStatus(NodePhase.UNREACHABLE, words=_not_served(found.engine))] * found.nodes
 
     def look(self) -> None:
         """Ask for newer statuses of the gangs that are observed; :attr:`changed` tells of those that differ. Does not wait."""
@@ -218,4 +206,12 @@ class EngineSet:
         try:
             return self._runners[name]
         except KeyError:
-            raise NotServed(f"engine {name} is not served now; start muster serve with --engine {name}") from None
+            raise NotYet(_not_served(name), unknown=True) from None  # something of the gang may run there
+
+
+def _has_secrets(containers: Iterable[Mapping[str, Any]]) -> bool:
+    return any(container.get("secrets") for container in containers)
+
+
+def _not_served(name: str) -> str:
+    return f"engine {name} is not served now; start muster serve with --engine {name}"

@@ -1,4 +1,4 @@
-"""The runner of each engine, with threads of its own: the controller asks, reads the newest answer, and never waits for an engine.
+"""The runner of an engine, with threads of its own: the controller reads the newest response, and never waits for an engine.
 
 An engine that hangs (a Docker daemon that accepts connections and does not answer, a cloud behind a broken route) delays its own gangs
 alone. Those keep the state that was seen last, and can still be timed out and asked to stop; gangs of other engines notice nothing.
@@ -6,14 +6,14 @@ alone. Those keep the state that was seen last, and can still be timed out and a
 
 from __future__ import annotations
 
+import errno
 import logging
 import threading
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
-from functools import partial
 from math import inf
-from typing import Any, NoReturn, TypeVar
+from typing import Any, TypeVar
 
 from orchestrator import machine
 from orchestrator.domain.hosts import Capacity
@@ -33,7 +33,6 @@ from orchestrator.engines.api import (
 )
 from orchestrator.engines.toolkit.backoff import Backoff
 from orchestrator.engines.toolkit.looks import status_of
-from orchestrator.engines.transience import is_final
 
 log = logging.getLogger("muster.engines")
 
@@ -45,17 +44,31 @@ _CLOSING = 5.0
 """Seconds that :meth:`Runner.close` gives the call that is being carried out."""
 
 _LOOKS = "looks"
-"""Subject of a failure of all looks."""
+"""Subject of a failure to poll all gangs."""
 _LOOKING, _SELDOM = 50.0, 2.0
-"""Pause between two looks at all gangs, in multiples of the processor time of the first, so that looks take 2 % of a core; and its
+"""Pause between two polls of all gangs, in multiples of the processor time of the first, so that they take 2 % of a core; and its
 limit [s]."""
+
+_FINAL = frozenset(
+    {
+        errno.E2BIG,  # command and environment are larger than the kernel takes
+        *(errno.EACCES, errno.EINVAL, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOENT),
+        *(errno.ENOEXEC, errno.ENOTDIR, errno.EPERM),
+    }
+)
+"""Errors for which trying again is useless: what the job asks for does not exist, is not allowed, or is malformed.
+
+Everything else may pass: no free descriptors, processes or memory (EMFILE, ENFILE, EAGAIN, ENOMEM), a volume that is full, read-only
+or away (ENOSPC, EDQUOT, EROFS, EIO, ESTALE), a network that is down. To wait in vain, with a reason that says for what, costs
+less than to fail a job that has done nothing wrong.
+"""
 
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Health:
-    """The answers of an engine, as a person is told of them."""
+    """The state of an engine, for people."""
 
     told_at: int | None
     """When it last reported its capacity, Unix time [ms]; None before the first time."""
@@ -67,11 +80,15 @@ class Health:
     """Seconds until the next of these tries; None where none fails."""
 
 
-class Underway(NotYet):
-    """The engine was asked to launch a gang and has not answered yet; the message is empty until it is overdue."""
+@dataclass
+class _Observed:
+    """A gang whose status the controller needs."""
 
-    def __init__(self, message: str) -> None:
-        super().__init__(message, unknown=True)
+    is_new: bool = True
+    """It was not polled yet."""
+    status: GangStatus | None = None
+    requested: float = 0.0
+    """When the engine was asked for that status (monotonic [s])."""
 
 
 class Runner:
@@ -85,17 +102,11 @@ class Runner:
         """By gang: its launch, under way or done, until the gang is over."""
         self._refused: dict[str, NotYet] = {}
         """By gang: what its last launch has to wait for."""
-        self._observed: dict[Handle, None] = {}
-        """Handles of the gangs whose status the controller wants."""
-        self._unseen: dict[Handle, None] = {}
-        """Those of them that were not looked at yet."""
-        self._seen: dict[Handle, GangStatus] = {}
-        self._asked: dict[Handle, float] = {}
-        """By handle: the newest status, and when the engine was asked for it (monotonic [s])."""
+        self._observed: dict[Handle, _Observed] = {}
         self._is_looking = False
         self._next_look = 0.0
-        """When the next look at all gangs is due (monotonic [s])."""
-        self._telling: Future[Capacity] | None = None
+        """When the next poll of all gangs is due (monotonic [s])."""
+        self._reporting: Future[Capacity] | None = None
         self._capacity: Capacity | None = None
         self._told_at: int | None = None
         self._backoff = Backoff(log)
@@ -104,7 +115,7 @@ class Runner:
         at_once = engine.traits.launches
         self._launching = machine.pool(f"launch {engine.name}", at_once) if at_once > 1 else self._thread
         self.first = self.ask_capacity()
-        """Done once the engine has told its capacity for the first time, or has failed to."""
+        """Done once the engine has reported its capacity for the first time, or has failed to."""
 
     def close(self) -> None:
         """Give the present call a few seconds, drop those that wait, and close the engine; its gangs go on."""
@@ -118,9 +129,11 @@ class Runner:
         return self._silence_of(self._thread, "silence")
 
     @property
-    def _launch_silence(self) -> str | None:
-        """The same of its launches, where these have threads of their own."""
-        return None if self._launching is self._thread else self._silence_of(self._launching, "launches")
+    def _any_silence(self) -> str | None:
+        """The same, also of its launches where these have threads of their own."""
+        return self.silence or (
+            None if self._launching is self._thread else self._silence_of(self._launching, "launches")
+        )
 
     def _silence_of(self, pool: machine.Pool, subject: str) -> str | None:
         since = pool.busy_since
@@ -128,14 +141,14 @@ class Runner:
             return None
         if (silence := self._backoff.failure(subject)) is None:
             began = machine.Moment(since, machine.wall() - passed)
-            what = "" if pool is self._thread else " a launch"
-            silence = f"the {self.engine.name} engine has not answered{what} since {began}"
+            call = "" if pool is self._thread else " a launch"
+            silence = f"the {self.engine.name} engine has not answered{call} since {began}"
             self._backoff.failed(subject, silence)
         return silence
 
     @property
     def unknown(self) -> str | None:
-        """Why it is not known what the engine has; None once it has told that."""
+        """Why the engine's capacity is not known; None once it has reported it."""
         if self._capacity is not None:
             return None
         return self.silence or self._backoff.failure("hosts") or f"the {self.engine.name} engine has not answered yet"
@@ -143,7 +156,7 @@ class Runner:
     @property
     def health(self) -> Health:
         """The engine's answers just now."""
-        problem = self.silence or self._launch_silence or self._backoff.failure("hosts") or self.unknown
+        problem = self._any_silence or self._backoff.failure("hosts") or self.unknown
         pauses = self._backoff.pauses()
         gangs = {subject[1]: pause for subject, pause in pauses.items() if isinstance(subject, tuple)}
         if _LOOKS in pauses:
@@ -157,24 +170,27 @@ class Runner:
 
         Requests a newer report and waits for it at most ``patience`` seconds.
         """
-        telling = self.ask_capacity()
+        reporting = self.ask_capacity()
         if patience and not self.silence:
-            wait([telling], patience)
+            wait([reporting], patience)
         return self._capacity
 
     def ask_capacity(self) -> Future[Capacity]:
         """Request a newer report of the capacity, unless one is under way; does not wait."""
         with self._lock:
-            if self._telling is None or self._telling.done():
-                self._telling = self._submit(self._tell_capacity)
-            return self._telling
+            if self._reporting is None or self._reporting.done():
+                self._reporting = self._submit(self._report_capacity)
+            return self._reporting
 
     def plan(self, gang: Gang) -> Plan[Any]:
         """As the engine plans it, on the caller's thread. Raises EngineError."""
-        return self._call("plan the gang", lambda: _lasting(lambda: self.engine.plan(gang)))
+        return self._call("plan the gang", lambda: self.engine.plan(gang), lasting=True)
 
     def launch(self, gang: str, plan: Callable[[], Plan[Any]], again: bool = True) -> Handle:
-        """The handle of the gang of that name once it is started. Raises :class:`Underway` until then, NotYet and EngineError.
+        """The handle of the gang of that name once it is started. Raises NotYet until then, and EngineError.
+
+        While the launch is under way, the message is empty until it is overdue.
+
 
         ``plan`` is called, on the caller's thread, where the gang's launch is not under way.
         ``again``: whether to try again where the last try has left nothing of the gang.
@@ -183,7 +199,7 @@ class Runner:
         if launch is None:
             refused = self._refused.get(gang)
             if refused and (self._backoff.waits(("launch", gang)) or not (again or refused.unknown)):
-                raise refused.with_traceback(None)  # else it keeps the frames of every look
+                raise refused.with_traceback(None)  # else it keeps the frames of every call
             try:
                 planned = plan()
             except Transient as error:
@@ -194,7 +210,7 @@ class Runner:
             launch = self._launches[gang] = self._submit(lambda: self._start(planned), self._launching)
             launch.add_done_callback(lambda _: self._changed(gang))
         if not launch.done():
-            raise Underway(self.silence or self._launch_silence or "")
+            raise NotYet(self._any_silence or "", unknown=True)
         try:
             return launch.result()  # again and again: the caller may not be able to record it
         except EngineError as error:
@@ -213,51 +229,44 @@ class Runner:
 
         Nodes that were seen running, or not yet at all, are unreachable where there is no newer status, and say why.
         """
-        if handle not in self._observed:
+        if (known := self._observed.get(handle)) is None:
             with self._lock:
-                self._observed[handle] = self._unseen[handle] = None
+                known = self._observed[handle] = _Observed()
             self._submit(self._look_at_new)
-        seen = self._seen.get(handle)
+        status = known.status
         if trouble := self._trouble(handle):
-            away = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
-            return [
-                replace(each, phase=away.phase, words=trouble) if each.running else each
-                for each in seen or [away] * handle.nodes
-            ]
-        return seen
+            unknown = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
+            nodes = status or [unknown] * handle.nodes
+            return [replace(each, phase=unknown.phase, words=trouble) if each.running else each for each in nodes]
+        return status
 
     def look(self) -> None:
         """Ask for newer statuses of all gangs that are observed, unless that is under way.
 
         Reports, too, that the engine has begun or ceased to be silent: its gangs look different then.
         """
-        silence = self.silence or self._launch_silence
-        if self._was_silent != (silence is not None):
+        if self._was_silent != (self._any_silence is not None):
             self._was_silent = not self._was_silent
             for gang in {*self._launches, *(handle.gang for handle in self._observed)}:
                 self._changed(gang)
-        if (
-            self._is_looking
-            or not self._observed
-            or machine.monotonic() < self._next_look
-            or self._backoff.waits(_LOOKS)
-        ):
-            return
-        self._is_looking = True
-        self._submit(self._look_at_all)
+        is_due = machine.monotonic() >= self._next_look and not self._backoff.waits(_LOOKS)
+        if self._observed and is_due and not self._is_looking:
+            self._is_looking = True
+            self._submit(self._look_at_all)
 
     def status_age(self, handle: Handle) -> float | None:
         """Seconds since the engine was asked for the newest status of the gang; None where it does not answer now."""
-        if handle not in self._seen or self._trouble(handle):
+        known = self._observed.get(handle)
+        if known is None or known.status is None or self._trouble(handle):
             return None
-        return machine.monotonic() - self._asked[handle]
+        return machine.monotonic() - known.requested
 
     def _trouble(self, handle: Handle) -> str | None:
         """Why there is no newer status of a gang."""
         return self.silence or self._backoff.failure(_LOOKS) or self._backoff.failure(("look", handle))
 
     def stop(self, handle: Handle, grace: float) -> GangStatus:
-        """Stop the gang on the caller's thread, which may take long, and look at it once more. Raises EngineError."""
+        """Stop the gang on the caller's thread, which may take long; returns its last status. Raises EngineError."""
         self._call("stop the gang", lambda: self.engine.stop(handle, grace))
         looking = self._submit(lambda: self._call("look at the gang", lambda: status_of(self.engine, handle)))
         try:
@@ -273,8 +282,7 @@ class Runner:
             self._launches.pop(gang, None)
             self._refused.pop(gang, None)
             if handle is not None:
-                for known in (self._observed, self._unseen, self._seen, self._asked):
-                    known.pop(handle, None)
+                self._observed.pop(handle, None)
         self._backoff.worked(("launch", gang))
         self._backoff.worked(("look", handle))
 
@@ -297,25 +305,33 @@ class Runner:
 
         return (pool or self._thread).submit(call)
 
-    def _call(self, what: str, body: Callable[[], T]) -> T:
-        """Carry out a call. Raises EngineError, whatever the engine raises; ``what``: for the message."""
+    def _call(self, action: str, body: Callable[[], T], *, lasting: bool = False) -> T:
+        """Carry out a call. Raises EngineError, whatever the engine raises.
+
+        ``action``: for the message. ``lasting``: what would fail again is no :class:`Transient`: see ``_FINAL``, and a zero byte in an
+        argument.
+        """
         name = self.engine.name
         try:
             return body()
         except EngineError:
             raise
         except OSError as error:
-            raise Transient(f"the {name} engine can't {what} now ({error}); trying again") from error
+            if lasting and error.errno in _FINAL:
+                raise EngineError(str(error)) from error
+            raise Transient(f"the {name} engine can't {action} now ({error}); trying again") from error
         except (Exception, SystemExit) as error:  # a library that wants to end the process must not end a thread
-            said = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+            if lasting and isinstance(error, ValueError):
+                raise EngineError(str(error)) from error
+            words = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
             raise EngineFault(
-                f"the {name} engine failed to {what} ({said}); the controller's log has the details; trying again"
+                f"the {name} engine failed to {action} ({words}); the controller's log has the details; trying again"
             ) from error
 
     def _failed(self, subject: Hashable, error: EngineError) -> None:
         self._backoff.failed(subject, str(error), error.__cause__ if isinstance(error, EngineFault) else None)
 
-    def _tell_capacity(self) -> Capacity:
+    def _report_capacity(self) -> Capacity:
         try:
             capacity = self._call("tell its hosts", self.engine.capacity)
         except EngineError as error:
@@ -331,7 +347,7 @@ class Runner:
     def _start(self, plan: Plan[Any]) -> Handle:
         subject = ("launch", plan.gang.name)
         try:
-            handle = self._call("start the gang", lambda: _lasting(lambda: self.engine.launch(plan)))
+            handle = self._call("start the gang", lambda: self.engine.launch(plan), lasting=True)
         except Transient as error:
             self._failed(subject, error)
             raise
@@ -339,14 +355,16 @@ class Runner:
         return handle
 
     def _look_at_new(self) -> None:
-        """The first look at all gangs that are observed and were not looked at yet."""
+        """The first poll of all gangs that were not polled yet."""
         with self._lock:
-            new, self._unseen = list(self._unseen), {}
+            new = {handle: known for handle, known in self._observed.items() if known.is_new}
+            for known in new.values():
+                known.is_new = False
         if new:
-            self._look(new)
+            self._look(list(new))
 
     def _look_at_all(self) -> None:
-        """One look at all gangs. The more processor time it takes, the longer the pause until the next one."""
+        """One poll of all gangs. The more processor time it takes, the longer the pause until the next one."""
         began = machine.processor_time()
         try:
             self._look([handle for handle in list(self._observed) if not self._backoff.waits(("look", handle))])
@@ -356,50 +374,41 @@ class Runner:
 
     def _look(self, handles: Sequence[Handle]) -> None:
         before = self._backoff.failure(_LOOKS)
-        asked = machine.monotonic()
+        requested = machine.monotonic()
+        looks: Sequence[Look] = ()
         try:
-            looks = self._call(
-                "look at its gangs", lambda: list(zip(handles, self.engine.observe(handles), strict=True))
-            )
+            looks = self._call("look at its gangs", lambda: self._statuses(handles))
         except EngineError as error:
             self._failed(_LOOKS, error)
-            looks = []
         else:
             self._backoff.worked(_LOOKS)
-        changed = [handle for handle, look in looks if self._note(handle, look, asked)]
+        changed = [handle for handle, look in zip(handles, looks, strict=False) if self._note(handle, look, requested)]
         for handle in changed if before == self._backoff.failure(_LOOKS) else list(self._observed):
             self._changed(handle.gang)
 
-    def _note(self, handle: Handle, look: Look, asked: float) -> bool:
-        """Keep what a look has found; returns whether it differs from what was known."""
+    def _statuses(self, handles: Sequence[Handle]) -> Sequence[Look]:
+        looks = self.engine.observe(handles)
+        if len(looks) != len(handles):
+            raise ValueError(f"{len(looks)} statuses of {len(handles)} gangs")
+        return looks
+
+    def _note(self, handle: Handle, look: Look, requested: float) -> bool:
+        """Keep a status; returns whether it differs from the one before."""
         subject = ("look", handle)
-        if isinstance(look, BaseException):
-            try:
-                self._call("look at the gang", partial(_raise, look))
-            except EngineError as error:
-                if handle not in self._observed:
-                    return False  # it was forgotten meanwhile
-                before = self._backoff.failure(subject)
-                self._failed(subject, error)
-                return before != self._backoff.failure(subject)
         with self._lock:
-            if handle not in self._observed:
+            if (known := self._observed.get(handle)) is None:
                 return False  # it was forgotten meanwhile
-            known, self._seen[handle], self._asked[handle] = self._seen.get(handle), look, asked
-        return self._backoff.worked(subject) or known != look
+            if not isinstance(look, BaseException):
+                before, known.status, known.requested = known.status, look, requested
+                return self._backoff.worked(subject) or before != look
 
+        def fail() -> None:
+            raise look
 
-def _raise(error: BaseException) -> NoReturn:
-    raise error
-
-
-def _lasting(body: Callable[[], T]) -> T:
-    """Carry out ``body``. Raises EngineError for what would fail again: see :func:`is_final`, and a zero byte in an argument."""
-    try:
-        return body()
-    except OSError as error:
-        if is_final(error):
-            raise EngineError(str(error)) from error
-        raise
-    except ValueError as error:
-        raise EngineError(str(error)) from error
+        try:
+            self._call("look at the gang", fail)
+        except EngineError as error:
+            failure = self._backoff.failure(subject)
+            self._failed(subject, error)
+            return failure != self._backoff.failure(subject)
+        return False

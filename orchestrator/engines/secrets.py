@@ -36,10 +36,10 @@ class Secrets:
         """
         self._file = Path(source).expanduser() if source not in (None, "env") else None
         self._allowed = source is not None
-        self._given: dict[str, str] = {}
+        self._environment: dict[str, str] = {}
         named = {name: environment.pop(name) for name in list(environment) if name.startswith(_PREFIX)}
         if source == "env":
-            self._given = {name.removeprefix(_PREFIX): value for name, value in named.items()}
+            self._environment = {name.removeprefix(_PREFIX): value for name, value in named.items()}
         self._read()
 
     def of(self, container: Mapping[str, Any], queue: str) -> dict[str, str]:
@@ -47,14 +47,14 @@ class Secrets:
 
         Raises SecretsError.
         """
-        wanted = container.get("secrets") or []
-        if wanted and not self._allowed:
+        secrets = container.get("secrets") or []
+        if secrets and not self._allowed:
             raise SecretsError(
-                f"secret {wanted[0]['name'][:100]}: this controller gives no secrets to jobs; start it with "
+                f"secret {secrets[0]['name'][:100]}: this controller gives no secrets to jobs; start it with "
                 "muster serve --secrets FILE (or env)"
             )
-        known = self._read() if wanted else {}
-        return {secret["name"]: self._value(secret, known, queue) for secret in wanted}
+        known = self._read() if secrets else {}
+        return {secret["name"]: self._value(secret, known, queue) for secret in secrets}
 
     def check(self, containers: Iterable[Mapping[str, Any]], queue: str) -> None:
         """Raises SecretsError where one of the containers asks for a secret that can't be given to a job of this queue."""
@@ -63,31 +63,24 @@ class Secrets:
 
     def _value(self, secret: Mapping[str, str], known: Mapping[str, Any], queue: str) -> str:
         reference = secret["valueFrom"]
+        title = f"secret {secret['name'][:100]}: {reference[:300]!r}"
         name = next((name for name in _names(reference) if self._as_kept(name) in known), None)
         if name is None:
             where = self._file or f"the environment of the controller ({_PREFIX}<name>)"
-            raise SecretsError(
-                f"secret {secret['name'][:100]}: {reference[:300]!r} is not in {where}; add it under this name"
-            )
+            raise SecretsError(f"{title} is not in {where}; add it under this name")
         value, match = known[self._as_kept(name)], _MANAGER.fullmatch(reference)
         if isinstance(value, dict) and value.keys() == {"value", "queues"}:
             if not isinstance(value["queues"], list) or queue not in value["queues"]:
-                raise SecretsError(
-                    f"secret {secret['name'][:100]}: {reference[:300]!r} is not for job queue {queue}; add the queue in {self._file}"
-                )
+                raise SecretsError(f"{title} is not for job queue {queue}; add the queue in {self._file}")
             value = value["value"]
         if name != reference and match and (key := match[2]):
             try:
                 value = json.loads(value)[key] if isinstance(value, str) else value[key]
             except (ValueError, KeyError, TypeError):
-                raise SecretsError(
-                    f"secret {secret['name'][:100]}: {reference[:300]!r} has no key {key[:100]!r}"
-                ) from None
+                raise SecretsError(f"{title} has no key {key[:100]!r}") from None
         text = value if isinstance(value, str) else json.dumps(value)
         if "\0" in text:
-            raise SecretsError(
-                f"secret {secret['name'][:100]}: {reference[:300]!r} has a zero byte, which no variable can have"
-            )
+            raise SecretsError(f"{title} has a zero byte, which no variable can have")
         return text
 
     def _as_kept(self, name: str) -> str:
@@ -96,7 +89,7 @@ class Secrets:
 
     def _read(self) -> Mapping[str, Any]:
         if self._file is None:
-            return self._given
+            return self._environment
         try:
             if self._file.stat().st_mode & 0o077:
                 raise SecretsError(f"{self._file}: others can read these secrets; chmod 600 {self._file}")

@@ -9,12 +9,6 @@ import threading
 import time
 from pathlib import Path
 
-import pytest
-
-from orchestrator.engines.api import EngineError, NotYet
-from orchestrator.engines.slurm import engine as slurm
-from orchestrator.engines.slurm.engine import SlurmEngine
-from orchestrator.engines.slurm.slurm_commands import call
 from orchestrator.engines.toolkit.looks import status_of
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.node_outcomes import read_outcome
@@ -98,29 +92,6 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
         bench.cluster.start("n2")
 
 
-def test_a_slow_sbatch_holds_nobody_up_and_submits_once(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    go = threading.Event()
-
-    def slow(*command: str, text: str | None = None) -> str:
-        assert go.wait(60 * PATIENCE)
-        return call(*command, text=text)
-
-    monkeypatch.setattr(slurm, "call", slow)
-    monkeypatch.setattr(slurm, "_PATIENCE", 0.2)
-    gang = bench.gang("exit 4")
-    plan = bench.engine.plan(gang)
-    for _ in range(3):
-        with pytest.raises(
-            NotYet, match="Slurm: the gang is being handed to slurmctld; if this lasts, see `scontrol ping`"
-        ) as late:
-            bench.engine.launch(plan)
-        assert late.value.unknown, "it did not wait for the command, which nobody has let go"
-    go.set()
-    handle = bench.launch(gang)
-    assert [node.exit_code for node in bench.ended(handle)] == [4]
-    assert bench.cluster.run("squeue", "-h", "-t", "all", "-o", "%k").split().count(gang.name) == 1
-
-
 def test_a_stop_that_began_without_slurmctld_leaves_the_whole_grace_from_when_the_nodes_were_asked(
     bench: SlurmBench,
 ) -> None:
@@ -169,31 +140,6 @@ def test_a_frozen_slurmctld_is_named_by_the_gangs_that_run_and_by_those_that_are
     finally:
         daemon.send_signal(signal.SIGCONT)
         served.close()
-
-
-@pytest.mark.skipif(not os.environ.get("MUSTER_LONG"), reason="half a minute: MUSTER_LONG=1, in make bits")
-def test_slurmctld_is_away_for_a_while(bench: SlurmBench) -> None:
-    handle = bench.ready(bench.gang(POLITE, 2))
-    bench.saved(handle)
-    bench.cluster.kill("slurmctld")
-    with pytest.raises(NotYet, match="Slurm: slurmctld does not answer"):
-        bench.launch(bench.gang(suffix="2"))  # asks again while there is no answer
-    assert all(node.running for node in status_of(bench.engine, handle)), "no news is no end"
-    with pytest.raises(EngineError, match=r"^slurmctld does not answer \(.*\); see `scontrol ping`$"):
-        SlurmEngine()
-    bench.cluster.start("slurmctld")
-    wait_for(lambda: "UP" in bench.cluster.run("scontrol", "ping", check=False), 30, "it is back")
-
-    def launched() -> str | None:
-        try:
-            return bench.launch(bench.gang("exit 4", suffix="2"))
-        except NotYet:
-            return None
-
-    second = wait_for(launched, 30, "it is submitted")
-    assert [node.exit_code for node in bench.ended(second)] == [4]
-    bench.engine.stop(handle, 30.0)
-    assert [node.exit_code for node in status_of(bench.engine, handle)] == [75, 75] and bench.log().count("saved") == 2
 
 
 def test_the_time_limit_is_announced_so_that_the_nodes_save_and_leave(bench: SlurmBench) -> None:

@@ -46,9 +46,9 @@ class AwsConfig(BaseModel):
     profile: str | None = None
 
     def with_options(self, options: Mapping[str, str]) -> AwsConfig:
-        """The same with what tags say."""
-        told = {option.name.replace("-", "_"): options[option.name] for option in OPTIONS if options.get(option.name)}
-        return self.model_copy(update=told)
+        """The same with the values of tags."""
+        found = {option.name.replace("-", "_"): options[option.name] for option in OPTIONS if options.get(option.name)}
+        return self.model_copy(update=found)
 
 
 def config_path(home: Path) -> Path:

@@ -67,15 +67,17 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
             "run it under Muster's supervisor; give it one"
         )
     ranges, overrides = [], []
-    for _, group in groupby(range(len(nodes)), key=lambda index: json.dumps(_like(gang, nodes[index]), default=str)):
+    kinds = [
+        (_container(gang, node, config, plain[index]), "" if plain[index] else _node(gang, node, config))
+        for index, node in enumerate(nodes)
+    ]
+    for (container, description), group in groupby(range(len(nodes)), key=kinds.__getitem__):
         indices = list(group)
-        first = nodes[indices[0]]
-        target = f"{indices[0]}:{indices[-1]}"
-        container = _container(gang, first, config, plain[indices[0]])
-        ranges.append({"targetNodes": target, "container": container})
-        if not plain[indices[0]]:
-            told = {"name": "MUSTER_NODE", "value": _node(gang, first, config)}
-            overrides.append({"targetNodes": target, "containerOverrides": {"environment": [told]}})
+        target = {"targetNodes": f"{indices[0]}:{indices[-1]}"}
+        ranges.append({**target, "container": container})
+        if description:
+            variable = {"name": "MUSTER_NODE", "value": description}
+            overrides.append({**target, "containerOverrides": {"environment": [variable]}})
     if len(ranges) > _MOST_RANGES:
         raise EngineError(f"the nodes are of {len(ranges)} kinds; AWS Batch takes at most {_MOST_RANGES} in one job")
     definition: dict[str, Any] = {
@@ -87,8 +89,9 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
     }
     digest = hashlib.sha256(json.dumps(definition, sort_keys=True).encode()).hexdigest()[:32]
     definition["tags"] = {DIGEST: digest}
+    # one name for each attempt, by which a job is found again if the controller died before it noted the submission
     submission: dict[str, Any] = {
-        "jobName": job_name(gang),
+        "jobName": _name((gang.title or "muster")[:50] + f"-{gang.job}-{gang.attempt}-{gang.epoch}", 128),
         "jobQueue": config.job_queue,
         "tags": {GANG: gang.name, "muster:run": gang.run},
     }
@@ -100,12 +103,6 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
         submission["shareIdentifier"] = config.share
         submission["schedulingPriorityOverride"] = gang.priority
     return Requests(definition, submission, tuple(not each for each in plain))
-
-
-def job_name(gang: Gang) -> str:
-    """One name for each attempt, by which a job is found again if the controller died before it noted the submission."""
-    tail = f"-{gang.job}-{gang.attempt}-{gang.epoch}"
-    return _name((gang.title or "muster")[:50] + tail, 128)
 
 
 def _name(text: str, most: int) -> str:
@@ -127,18 +124,10 @@ def _image(gang: Gang, index: int) -> str:
     return str(gang.containers[index].get("image") or "") if gang.containers else ""
 
 
-def _like(gang: Gang, node: NodePlan) -> tuple[Any, ...]:
-    """The common part of the nodes of one range."""
-    index = node.contract.node_index
-    container = dict(gang.containers[index]) if gang.containers else {}
-    placement = node.placement
-    return node.command, dict(node.environment), container, placement.cpus, len(placement.gpus), placement.memory
-
-
 def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> dict[str, Any]:
     """``containerProperties`` of a node: the job's own, with what Muster needs."""
     index = node.contract.node_index
-    given = dict(gang.containers[index]) if gang.containers else {}
+    own = dict(gang.containers[index]) if gang.containers else {}
     placement = node.placement
     resources = [
         {"type": "VCPU", "value": str(max(1, math.ceil(placement.cpus)))},
@@ -148,7 +137,7 @@ def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> di
         resources.append({"type": "GPU", "value": str(len(placement.gpus))})
     image = _image(gang, index)
     container: dict[str, Any] = {
-        **{key: value for key, value in given.items() if key not in _OURS and value not in ([], {}, None)},
+        **{key: value for key, value in own.items() if key not in _OURS and value not in ([], {}, None)},
         "image": config.image if image in ("", "muster") else image,
         "resourceRequirements": resources,
         "command": list(node.command) if plain else ["python", "-P", "-m", "worker.aws_node", "--", *node.command],
@@ -156,12 +145,12 @@ def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> di
     }
     if plain and not node.command:
         del container["command"]  # the image's own runs
-    linux = {"sharedMemorySize": max(64, placement.memory // 2), **(given.get("linuxParameters") or {})}
+    linux = {"sharedMemorySize": max(64, placement.memory // 2), **(own.get("linuxParameters") or {})}
     if config.efa:
         device = {"hostPath": "/dev/infiniband/uverbs0", "containerPath": "/dev/infiniband/uverbs0"}
         linux["devices"] = [*(linux.get("devices") or []), {**device, "permissions": ["READ", "WRITE", "MKNOD"]}]
         unlimited = {"name": "memlock", "softLimit": -1, "hardLimit": -1}
-        container["ulimits"] = [*(given.get("ulimits") or []), unlimited]
+        container["ulimits"] = [*(own.get("ulimits") or []), unlimited]
     container["linuxParameters"] = linux
     container.setdefault("logConfiguration", {"logDriver": "awslogs", "options": {"awslogs-group": config.log_group}})
     if config.job_role:
@@ -170,8 +159,8 @@ def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> di
         container.setdefault("instanceType", config.instance_type)
     if config.file_system and not plain:
         volume, mount = _volume(config)
-        container["volumes"] = [*(given.get("volumes") or []), volume]
-        container["mountPoints"] = [*(given.get("mountPoints") or []), mount]
+        container["volumes"] = [*(own.get("volumes") or []), volume]
+        container["mountPoints"] = [*(own.get("mountPoints") or []), mount]
     return container
 
 

@@ -5,20 +5,18 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import boto3
-import yaml
-from botocore.exceptions import BotoCoreError, ClientError, NoCredentialsError, NoRegionError
-from botocore.parsers import ResponseParserError
+from botocore.exceptions import ClientError
 from pydantic import ValidationError
 
 from orchestrator.domain.errors import ServerError
 from orchestrator.engines.aws_batch.config import AwsConfig, config_path, problem_of, save_config
+from orchestrator.engines.aws_batch.errors import FAILURES, session_for, words_of
 from shared_store.contract.error_text import nearest
 
 _PLACES = (
@@ -28,6 +26,8 @@ _PLACES = (
 _POLL = 2.0
 _CANCELLED = ("cancelled", "The following resource(s) failed")
 """Reasons of events that follow from another one's failure."""
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -50,40 +50,33 @@ class Stack:
 
     def __init__(self, name: str, region: str | None, profile: str | None = None) -> None:
         self.name, self.profile = name, profile
-        with _said():
-            self._session = boto3.Session(region_name=region, profile_name=profile)
-            if self._session.get_credentials() is None:
-                raise NoCredentialsError
-            if not self._session.region_name:
-                raise NoRegionError
+        with _reported():
+            self._session = session_for(region, profile)
             self.region = str(self._session.region_name)
             self._api = self._session.client("cloudformation")
 
-    def describe(self) -> dict[str, Any] | None:
-        """The stack as CloudFormation has it; None where there is none."""
-        with _said():
-            try:
-                found: dict[str, Any] = self._api.describe_stacks(StackName=self.name)["Stacks"][0]
-            except (ClientError, IndexError) as error:
-                if isinstance(error, IndexError) or "does not exist" in str(error):
-                    return None
-                raise
-        return None if found["StackStatus"] == "DELETE_COMPLETE" else found
+    def describe(self, stack: str | None = None) -> dict[str, Any] | None:
+        """The stack, or that of an id, as CloudFormation has it; None where there is none."""
+        with _reported():
+            found = _existing(lambda: self._api.describe_stacks(StackName=stack or self.name)["Stacks"])
+        return found[0] if found and found[0]["StackStatus"] != "DELETE_COMPLETE" else None
 
-    def parameters(self, template: str, given: Mapping[str, str], existing: bool) -> list[dict[str, Any]]:
-        """Those of a request: the given ones, and as they were (or their defaults) all others."""
-        known = _parameters(template)
-        for key in given:
+    def parameters(self, template: str, chosen: Mapping[str, str], existing: bool) -> list[dict[str, Any]]:
+        """Those of a request: the chosen ones, and as they were (or their defaults) all others."""
+        with _reported():
+            summary = self._api.get_template_summary(TemplateBody=template)
+        known = [each["ParameterKey"] for each in summary.get("Parameters", [])]
+        for key in chosen:
             if key not in known:
                 hint = nearest(key, sorted(known))
                 raise ServerError(f"--parameter {key}: the template has no such parameter; {hint}")
-        request: list[dict[str, Any]] = [{"ParameterKey": key, "ParameterValue": value} for key, value in given.items()]
+        request: list[dict[str, Any]] = [{"ParameterKey": key, "ParameterValue": chosen[key]} for key in chosen]
         if existing:
-            before = {each["ParameterKey"] for each in (self.describe() or {}).get("Parameters", [])}
-            request += [{"ParameterKey": key, "UsePreviousValue": True} for key in known if key in before - set(given)]
+            before = {each["ParameterKey"] for each in (self.describe() or {}).get("Parameters", [])} - set(chosen)
+            request += [{"ParameterKey": key, "UsePreviousValue": True} for key in known if key in before]
         return request
 
-    def create(self, template: str, given: Mapping[str, str]) -> str | None:
+    def create(self, template: str, chosen: Mapping[str, str]) -> str | None:
         """Create the stack or bring it up to date; returns its id, None where nothing has to change."""
         found = self.describe()
         status = found["StackStatus"] if found else ""
@@ -96,15 +89,13 @@ class Stack:
         request = {
             "StackName": self.name,
             "TemplateBody": template,
-            "Parameters": self.parameters(template, given, bool(found)),
+            "Parameters": self.parameters(template, chosen, bool(found)),
             "Capabilities": ["CAPABILITY_IAM"],
             "Tags": [{"Key": "muster:stack", "Value": self.name}],
         }
-        with _said():
-            if not found:
-                return str(self._api.create_stack(**request)["StackId"])
+        with _reported():
             try:
-                return str(self._api.update_stack(**request)["StackId"])
+                return str((self._api.update_stack if found else self._api.create_stack)(**request)["StackId"])
             except ClientError as error:
                 if "No updates are to be performed" in str(error):
                     return None
@@ -115,26 +106,35 @@ class Stack:
         found = self.describe()
         if found is None:
             raise ServerError(f"there is no stack {self.name} in {self.region}")
-        with _said():
+        with _reported():
             self._api.delete_stack(StackName=found["StackId"])
         return str(found["StackId"])
 
     def follow(self, stack: str, since: float) -> Iterator[StackEvent]:
         """Events of the stack (an id) from ``since`` (Unix time [s]) on, until it rests."""
         seen: set[str] = set()
+        pages = self._api.get_paginator("describe_stack_events")
         while True:
-            status = self._status(stack)
-            for raw in self._events(stack):
+            found = self.describe(stack)
+            with _reported():
+                events = _existing(lambda: list(pages.paginate(StackName=stack).search("StackEvents[]"))) or []
+            for raw in reversed(events):  # the newest comes first
                 if raw["EventId"] not in seen and raw["Timestamp"].timestamp() >= since:
                     seen.add(raw["EventId"])
-                    yield _event(raw)
-            if not status.endswith("_IN_PROGRESS"):
+                    yield StackEvent(
+                        raw["Timestamp"].astimezone().strftime("%H:%M:%S"),
+                        raw["LogicalResourceId"],
+                        raw.get("ResourceType", ""),
+                        raw.get("ResourceStatus", ""),
+                        raw.get("ResourceStatusReason", ""),
+                    )
+            if found is None or not found["StackStatus"].endswith("_IN_PROGRESS"):
                 return
             time.sleep(_POLL)
 
     def outputs(self) -> dict[str, str]:
-        """The stack's outputs by name. Raises ServerError where it is not there or not whole."""
-        return _outputs(self._found())
+        """The stack's outputs by name. Raises ServerError where it does not exist."""
+        return {each["OutputKey"]: each["OutputValue"] for each in self._found().get("Outputs") or []}
 
     def _found(self) -> dict[str, Any]:
         """The stack as CloudFormation has it. Raises ServerError where there is none."""
@@ -144,33 +144,30 @@ class Stack:
 
     def status(self) -> dict[str, Any]:
         """The stack, its queue and compute environment with their own words, its jobs by state, and its image."""
-        found = self._found()
-        outputs = _outputs(found)
-        told: dict[str, Any] = {"stack": self.name, "region": self.region, "status": found["StackStatus"]}
-        told |= {"reason": found.get("StackStatusReason", ""), "outputs": outputs}
+        found, outputs = self._found(), self.outputs()
+        status: dict[str, Any] = {"stack": self.name, "region": self.region, "status": found["StackStatus"]}
+        status |= {"reason": found.get("StackStatusReason", ""), "outputs": outputs}
         if "JobQueueArn" not in outputs:
-            return told
-        with _said():
+            return status
+        with _reported():
             batch = self._session.client("batch")
             queues = batch.describe_job_queues(jobQueues=[outputs["JobQueueArn"]])["jobQueues"]
             described = batch.describe_compute_environments(computeEnvironments=[outputs["ComputeEnvironmentArn"]])
             for key, each in (("queue", queues), ("computeEnvironment", described["computeEnvironments"])):
-                wanted = ("state", "status", "statusReason")
-                told[key] = {name: each[0][name] for name in wanted if each[0].get(name)} if each else {}
-            told["jobs"] = self.jobs(outputs["JobQueueArn"])
-            told["image"] = self._image(outputs["RepositoryUri"])
-        return told
+                names = ("state", "status", "statusReason")
+                status[key] = {name: each[0][name] for name in names if each[0].get(name)} if each else {}
+            return status | {"jobs": self.jobs(outputs["JobQueueArn"]), "image": self._image(outputs["RepositoryUri"])}
 
     def jobs(self, queue: str) -> dict[str, int]:
         """Numbers of the queue's jobs by state, of the states in which they use or wait for instances."""
-        with _said():
+        counts = {}
+        with _reported():
             pages = self._session.client("batch").get_paginator("list_jobs")
-            states = ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING")
-            counts = {
-                state: sum(len(page["jobSummaryList"]) for page in pages.paginate(jobQueue=queue, jobStatus=state))
-                for state in states
-            }
-        return {state: count for state, count in counts.items() if count}
+            for state in ("SUBMITTED", "PENDING", "RUNNABLE", "STARTING", "RUNNING"):
+                jobs = pages.paginate(jobQueue=queue, jobStatus=state).search("jobSummaryList[]")
+                if count := sum(1 for _ in jobs):
+                    counts[state] = count
+        return counts
 
     def _image(self, repository: str) -> str | None:
         """When the image ``latest`` was pushed; None where it was not yet."""
@@ -182,54 +179,15 @@ class Stack:
             return None
         return str(details[0]["imagePushedAt"]) if details else None
 
-    def _status(self, stack: str) -> str:
-        with _said():
-            try:
-                return str(self._api.describe_stacks(StackName=stack)["Stacks"][0]["StackStatus"])
-            except (ClientError, IndexError) as error:
-                if isinstance(error, IndexError) or "does not exist" in str(error):
-                    return "DELETE_COMPLETE"
-                raise
 
-    def _events(self, stack: str) -> list[dict[str, Any]]:
-        """Oldest first."""
-        with _said():
-            try:
-                pages = self._api.get_paginator("describe_stack_events").paginate(StackName=stack)
-                return [event for page in pages for event in page["StackEvents"]][::-1]
-            except ClientError as error:
-                if "does not exist" in str(error):
-                    return []
-                raise
-
-
-def _outputs(found: Mapping[str, Any]) -> dict[str, str]:
-    return {each["OutputKey"]: each["OutputValue"] for each in found.get("Outputs") or []}
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML with CloudFormation's own tags, whose values do not matter here."""
-
-
-_Loader.add_multi_constructor("!", lambda _loader, _suffix, _node: None)
-
-
-def _parameters(template: str) -> list[str]:
-    """Names of a template's parameters. Raises ServerError."""
+def _existing(call: Callable[[], T]) -> T | None:
+    """The result of a call of CloudFormation; None where the stack does not exist."""
     try:
-        return list(yaml.load(template, _Loader).get("Parameters") or {})
-    except (yaml.YAMLError, AttributeError, TypeError) as error:
-        raise ServerError(f"the template is no CloudFormation template: {error}") from None
-
-
-def _event(raw: Mapping[str, Any]) -> StackEvent:
-    return StackEvent(
-        raw["Timestamp"].astimezone().strftime("%H:%M:%S"),
-        raw["LogicalResourceId"],
-        raw.get("ResourceType", ""),
-        raw.get("ResourceStatus", ""),
-        raw.get("ResourceStatusReason", ""),
-    )
+        return call()
+    except ClientError as error:
+        if "does not exist" in str(error):
+            return None
+        raise
 
 
 def first_failure(events: Sequence[StackEvent]) -> str:
@@ -287,16 +245,10 @@ def write_config(home: Path, stack: Stack, endpoint_url: str | None) -> Path:
 
 
 @contextmanager
-def _said() -> Iterator[None]:
+def _reported() -> Iterator[None]:
     """Report a refusal of AWS or boto3 in one line."""
     try:
         yield
-    except NoCredentialsError:
-        raise ServerError("AWS: no credentials; run `aws configure`, or set AWS_PROFILE") from None
-    except NoRegionError:
-        raise ServerError("AWS: no region; give --region, or set AWS_DEFAULT_REGION") from None
-    except ClientError as error:
-        told = error.response.get("Error", {})
-        raise ServerError(f"AWS ({error.operation_name}): {told.get('Message') or told.get('Code')}") from None
-    except (BotoCoreError, ResponseParserError) as error:
-        raise ServerError(f"AWS: {error}") from None
+    except FAILURES as error:
+        operation = f" ({error.operation_name})" if isinstance(error, ClientError) else ""
+        raise ServerError(f"AWS{operation}: {words_of(error)}") from None

@@ -12,30 +12,24 @@ from docker.errors import APIError
 from orchestrator.engines.api import EngineError, NotYet
 
 
-class NoAnswer(NotYet):
-    """Docker Engine does not answer now; what it runs may go on."""
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message, unknown=True)
-
-
 @contextmanager
 def answered() -> Iterator[None]:
     """Around calls of Docker's client, all of whose errors are OSErrors, as those of the store are.
 
     Raises:
-        NoAnswer: Docker Engine is not reached, or can't answer (5xx).
+        NotYet: Docker Engine is not reached, or can't answer (5xx).
         EngineError: It refuses, in its own words.
     """
     try:
         yield
     except APIError as error:
-        said = " ".join((error.explanation or str(error)).split())
+        words = " ".join((error.explanation or str(error)).split())
         if not error.is_server_error():
-            raise EngineError(f"Docker Engine refuses: {said}") from error
-        raise NoAnswer(f"Docker Engine has no answer ({said}); see its log (journalctl -u docker)") from error
+            raise EngineError(f"Docker Engine refuses: {words}") from error
+        why = f"Docker Engine has no answer ({words}); see its log (journalctl -u docker)"
+        raise NotYet(why, unknown=True) from error
     except (requests.RequestException, urllib3.exceptions.HTTPError) as error:
-        raise NoAnswer(unanswered(error)) from error
+        raise NotYet(unanswered(error), unknown=True) from error
 
 
 def unanswered(error: BaseException) -> str:
@@ -45,9 +39,9 @@ def unanswered(error: BaseException) -> str:
 
 def _cause(error: BaseException) -> str:
     """The operating system's words, which Docker's client, requests and urllib3 each wrap; else those of the outermost."""
-    said, inner = " ".join(str(error).split()), error.__cause__ or error.__context__
+    words, inner = " ".join(str(error).split()), error.__cause__ or error.__context__
     while inner is not None:
         if isinstance(inner, OSError) and not isinstance(inner, requests.RequestException):
-            said = inner.strerror or str(inner) or said
+            words = inner.strerror or str(inner) or words
         inner = inner.__cause__ or inner.__context__
-    return said
+    return words

@@ -46,14 +46,13 @@ from orchestrator.engines.api import (
     node_plans,
 )
 from orchestrator.engines.docker import TRAITS
-from orchestrator.engines.docker.answers import NoAnswer, answered, unanswered
+from orchestrator.engines.docker.answers import answered, unanswered
 from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
-from orchestrator.engines.toolkit.endings import ended
 from orchestrator.engines.toolkit.gpus import visible_gpus
-from orchestrator.engines.toolkit.looks import one_by_one
+from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
-from orchestrator.engines.toolkit.stopping import stop_within
+from orchestrator.engines.toolkit.waiting import stop_within
 from shared_store import __version__
 from shared_store.contract.error_text import counted
 from shared_store.volume.files import DamagedFile
@@ -139,7 +138,7 @@ class DockerEngine:
         try:
             with answered():
                 listed = self._listed()
-        except NoAnswer as error:
+        except NotYet as error:
             if not self._away:  # said once, not at every look
                 log.warning("engine docker: %s", error)
             self._away = True
@@ -158,7 +157,12 @@ class DockerEngine:
                     list(pool.map(lambda container: _stop(container, grace), found.values()))
                 # what is not copied yet would go with the container
                 copies = list(self._copies_of(handle.gang).values())
-                stop_within(_COPYING, lambda: _uncopied(copies), engine=self.name, gang=handle.gang, pause=0.05)
+
+                def uncopied() -> str:
+                    left = sum(not copy.wait(0.0) for copy in copies)
+                    return f"{counted(left, 'log')} not copied to the end" if left else ""
+
+                stop_within(_COPYING, uncopied, engine=self.name, gang=handle.gang, pause=0.05)
             self._ended[handle.gang] = dict(
                 enumerate(self._observe(handle, self._listed(handle.gang).get(handle.gang, {})))
             )
@@ -188,9 +192,9 @@ class DockerEngine:
     def _launch(self, plan: Plan[Sequence[ContainerRequest]]) -> Handle:
         gang = plan.gang
         images = [self._image(request.image) for request in plan.request]
-        there = self._containers(gang.name)
+        existing = self._containers(gang.name)
         for index, (image, command) in enumerate(zip(images, gang.commands, strict=True)):
-            if index not in there:
+            if index not in existing:
                 _check_image(plan.request[index].image, image, command)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
@@ -199,9 +203,9 @@ class DockerEngine:
         handle = Handle(self.name, gang.name, len(requests), {**store_facts(gang), "addresses": addresses})
         try:
             for index in sorted(range(len(requests)), key=lambda index: index != gang.main):
-                if index in there:
-                    if there[index].status == "created":  # the controller was killed between the two
-                        there[index].start()
+                if index in existing:
+                    if existing[index].status == "created":  # the controller was killed between the two
+                        existing[index].start()
                 elif read_outcome(run, gang.job, gang.attempt, index) is None:
                     container = self._create(requests[index], images[index], network)
                     container.start()
@@ -260,16 +264,15 @@ class DockerEngine:
         raise EngineError(f"no network for the gang: {problem}")
 
     def _create(self, request: ContainerRequest, image: Image, network: Network) -> Container:
-        supervised = _VERSION in (image.labels or {})
-        if supervised:
-            self._kernels.mkdir(parents=True, exist_ok=True)
-        entrypoint, default = _own_command(image)
+        kernels = self._kernels if _VERSION in (image.labels or {}) else None
+        if kernels:
+            kernels.mkdir(parents=True, exist_ok=True)
         place = self._client.api.create_endpoint_config(ipv4_address=request.contract.address)
         return self._client.containers.create(
             image,
             network=network.name,
             networking_config={network.name: place},
-            **request.arguments(entrypoint, default, self._kernels if supervised else None),
+            **request.arguments(*_own_command(image), kernels),
         )
 
     # -- watching -----------------------------------------------------------------------------------------------------
@@ -291,24 +294,22 @@ class DockerEngine:
 
     def _node(self, handle: Handle, index: int, listed: Mapping[str, Any] | None) -> NodeStatus:
         address, container = handle.facts["addresses"][index], None
+        runs = NodeStatus(NodePhase.RUNNING, address)
         if listed is not None:
             if listed["State"] in _RUNNING and (PLAIN not in listed["Labels"] or self._is_followed(handle, index)):
-                return NodeStatus(NodePhase.RUNNING, address)
+                return runs
             with contextlib.suppress(NotFound):  # a stop has removed it since it was listed
                 container = self._client.containers.get(listed["Id"])
         if container is None:
             return self._ended.get(handle.gang, {}).get(index) or ended(address, None)
         self._follow(container, handle, index)
-        return self._status(container, handle, index, address)
-
-    def _status(self, container: Container, handle: Handle, index: int, address: str) -> NodeStatus:
         state = container.attrs["State"]
         if state["Status"] in _RUNNING:
-            return NodeStatus(NodePhase.RUNNING, address)
+            return runs
         status = _ended(state, address)
         if container.labels.get(PLAIN):
             if not self._settle(handle, index, state, status.words):
-                return NodeStatus(NodePhase.RUNNING, address, "its container has ended, its log is still being copied")
+                return dataclasses.replace(runs, words="its container has ended, its log is still being copied")
         elif status.exit_code and not status.words:
             with contextlib.suppress(APIError):  # a logging driver that can't be read
                 words = container.logs(tail=1).decode(errors="replace").strip()
@@ -347,17 +348,13 @@ class DockerEngine:
 
     def _remove(self, gang: str) -> None:
         for container in self._containers(gang).values():
-            try:
+            with contextlib.suppress(NotFound):
                 container.remove(force=True)
-            except NotFound:
-                pass
         for network in self._client.networks.list(filters={"label": f"{GANG}={gang}"}):
-            try:
+            with contextlib.suppress(APIError):  # a container that is still going; the next stop removes it
                 network.remove()
-            except APIError:
-                pass  # a container that is still going; the next stop removes it
         keys = list(self._copies_of(gang))
-        with self._copying:  # another thread may look through them
+        with self._copying:  # another thread may read them
             for key in keys:
                 self._copies.pop(key, None)
 
@@ -377,22 +374,17 @@ def _ended(state: Mapping[str, Any], address: str) -> NodeStatus:
 
 def _check_image(name: str, image: Image, command: Sequence[str]) -> None:
     """Raises EngineError where the image lacks the command or the Muster that the job needs, or has another one than the controller."""
-    if not command and not any(_own_command(image)):
-        raise EngineError(
-            f"CannotCreateContainerError: No command specified: image {name} has neither ENTRYPOINT nor CMD, and the job no command; "
-            "give it one"
-        )
-    version = (image.labels or {}).get(_VERSION)
+    problem, version = "", (image.labels or {}).get(_VERSION)
     module = next((b for a, b in pairwise(command) if a == "-m" and b.startswith("worker.")), None)
+    if not command and not any(_own_command(image)):
+        problem = "has neither ENTRYPOINT nor CMD, and the job no command; give it one"
+        raise EngineError(f"CannotCreateContainerError: No command specified: image {name} {problem}")
     if version is None and module is not None:
-        raise EngineError(
-            f"image {name} has no Muster in it (no label {_VERSION}), which {module} needs: build it FROM the image of "
-            "containers/Dockerfile"
-        )
-    if version not in (None, __version__):
-        raise EngineError(
-            f"image {name} has Muster {version}, the controller {__version__}: build it anew with the controller's version"
-        )
+        problem = f"has no Muster in it (no label {_VERSION}), which {module} needs: build it FROM the image of containers/Dockerfile"
+    elif version not in (None, __version__):
+        problem = f"has Muster {version}, the controller {__version__}: build it anew with the controller's version"
+    if problem:
+        raise EngineError(f"image {name} {problem}")
 
 
 def _own_command(image: Image) -> tuple[list[str], list[str]]:
@@ -424,21 +416,13 @@ def _addresses(subnet: str, count: int) -> list[str]:
     return [f"{subnet.rpartition('.')[0]}.{index + 2}" for index in range(count)]
 
 
-def _uncopied(copies: Sequence[FollowedLog]) -> str:
-    """The number of copies that are under way, in words; empty once all have ended."""
-    left = sum(not copy.wait(0.0) for copy in copies)
-    return f"{counted(left, 'log')} not copied to the end" if left else ""
-
-
 def _stop(container: Container, grace: float) -> None:
     """SIGTERM, ``grace`` seconds later SIGKILL; a paused one can't be asked."""
     try:
         if container.status == "paused":
             container.unpause()
             container.kill()
-        elif container.status == "created":
-            return
-        else:
+        elif container.status != "created":
             container.stop(timeout=int(max(1.0, grace)))
     except APIError as error:  # it ended meanwhile, or is being removed
         if error.is_server_error():  # it may run: who asks again gives it its time again

@@ -8,6 +8,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from datetime import datetime
 from pathlib import Path
 
@@ -87,7 +88,7 @@ def _copy(container: Container, path: Path, limit: int, follow: bool) -> bytes |
     Raises OSError where the log can't be written.
     """
     last: bytes | None = b""
-    with LogCopy(path, limit) as copy:
+    with closing(LogCopy(path, limit)) as copy:
         for chunk, lines in _lines(container, follow):
             last = chunk if chunk.endswith(b"\n") else None
             copy.append(format_line(at, 0, "o", line) for at, line in lines)

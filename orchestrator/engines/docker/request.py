@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from docker.types import Mount
+from docker.types import DeviceRequest, Mount, Ulimit
 
 from orchestrator.engines.api import Gang, NodePlan
-from orchestrator.engines.docker.options import limits, linux
 from orchestrator.engines.toolkit.mounts import mounts_of
 from shared_store.contract.node import BUS_VARIABLES, NodeContract, sealed_in_image
 
@@ -18,6 +17,8 @@ STORE, KERNELS = "/muster/store", "/muster/kernels"
 """Paths of the store and of the cache of compiled kernels in a container of an image with Muster."""
 GANG, NODE, PLAIN = "muster.gang", "muster.node", "muster.plain"
 """Labels of containers and networks: whose they are, and whether they run without a supervisor."""
+_PERMISSIONS = {"READ": "r", "WRITE": "w", "MKNOD": "m"}
+"""Of devices, and their letters in Docker."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class ContainerRequest:
             default: Its ``CMD``, for a job that has no command. Docker takes it by itself only where it is told no entrypoint either.
             kernels: Directory for compiled kernels; None for an image without Muster, whose command runs without a supervisor.
         """
-        told = self.contract.to_env()
+        contract = self.contract.to_env()
         own = list(self.command or default)
         node = str(self.contract.node_index)
         arguments: dict[str, Any] = {
@@ -60,12 +61,12 @@ class ContainerRequest:
             **self.options,
         }
         if kernels is None:
-            environment = {**self.environment, **told}
+            environment = {**self.environment, **contract}
             environment = {name: value for name, value in environment.items() if name not in BUS_VARIABLES}
             mounts, entry, command = [*self.mounts], list(entrypoint) or None, own
         else:
             job = {"HOME": "/tmp", "WARP_CACHE_PATH": KERNELS, **self.environment}
-            environment = {"HOME": "/tmp", **sealed_in_image(job, told)}
+            environment = {"HOME": "/tmp", **sealed_in_image(job, contract)}
             mounts = [*self.mounts, Mount(STORE, self.store, "bind"), Mount(KERNELS, str(kernels), "bind")]
             # whoever owns the store writes it; that is seldom the user that the image names
             owner = Path(self.store).stat()
@@ -90,3 +91,48 @@ def container_request(gang: Gang, node: NodePlan, cores: float) -> ContainerRequ
         options={**limits(container, node, cores), **linux(container)},
         store=gang.store,
     )
+
+
+def limits(container: Mapping[str, Any], node: NodePlan, cores: float) -> dict[str, Any]:
+    """Cores, memory and GPUs of a node, as Docker's options.
+
+    ``/dev/shm`` has half of the memory, as on the engine aws-batch: Docker's 64 MiB are too few for NCCL between the ranks of a node.
+    """
+    placement = node.placement
+    options: dict[str, Any] = {
+        "nano_cpus": int(min(placement.cpus, cores) * 1e9),
+        "mem_limit": f"{placement.memory}m",
+    }
+    if placement.gpus:
+        options["device_requests"] = [DeviceRequest(device_ids=list(placement.gpus), capabilities=[["gpu"]])]
+    parameters = container.get("linuxParameters") or {}
+    options["shm_size"] = f"{parameters.get('sharedMemorySize') or max(64, placement.memory // 2)}m"
+    if (swap := parameters.get("maxSwap")) is not None:  # as on AWS, swappiness counts only beside it
+        options["memswap_limit"] = f"{placement.memory + swap}m"
+        options["mem_swappiness"] = parameters.get("swappiness", 60)
+    ulimits = container.get("ulimits") or []
+    options["ulimits"] = [Ulimit(name=u["name"], soft=u["softLimit"], hard=u["hardLimit"]) for u in ulimits]
+    return options
+
+
+def linux(container: Mapping[str, Any]) -> dict[str, Any]:
+    """The other members of ``containerProperties`` as options of Docker."""
+    parameters = container.get("linuxParameters") or {}
+    tmpfs = {
+        entry["containerPath"]: ",".join([f"size={entry['size']}m", *(entry.get("mountOptions") or [])])
+        for entry in parameters.get("tmpfs") or []
+    }
+    options = {
+        "tmpfs": tmpfs,
+        "devices": [_device(device) for device in parameters.get("devices") or []],
+        "user": container.get("user"),
+        "privileged": bool(container.get("privileged")),
+        "read_only": bool(container.get("readonlyRootFilesystem")),
+    }
+    return {"init": bool(parameters.get("initProcessEnabled")), **{k: v for k, v in options.items() if v}}
+
+
+def _device(device: Mapping[str, Any]) -> str:
+    permissions = device.get("permissions") or list(_PERMISSIONS)
+    letters = "".join(letter for name, letter in _PERMISSIONS.items() if name in permissions)
+    return f"{device['hostPath']}:{device.get('containerPath') or device['hostPath']}:{letters}"

@@ -16,8 +16,8 @@ import re
 import resource
 import signal
 import subprocess
-import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -38,13 +38,11 @@ from orchestrator.engines.api import (
 )
 from orchestrator.engines.local import TRAITS
 from orchestrator.engines.local.gangs import parent_of
-from orchestrator.engines.toolkit.endings import ended
-from orchestrator.engines.toolkit.environment import inherited
+from orchestrator.engines.toolkit.environment import inherited, node_environment, supervised
 from orchestrator.engines.toolkit.gpus import visible_gpus
-from orchestrator.engines.toolkit.looks import one_by_one
+from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.waiting import wait_until
-from shared_store.contract.node import NodeContract, sealed
 from shared_store.process.cgroups import own_group, remove_abandoned_groups
 from shared_store.process.memory_groups import memory_group, memory_home
 from shared_store.process.node_processes import NodeProcesses, end_nodes
@@ -95,7 +93,7 @@ class LocalEngine:
             "localhost",
             cpus or float(os.cpu_count() or 1),
             tuple(gpus if gpus is not None else visible_gpus()),
-            _memory(),
+            int(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20),
             machine=HERE,
         )
         self._children: dict[int, subprocess.Popen[bytes]] = {}
@@ -120,7 +118,10 @@ class LocalEngine:
                 taken, note = _user(user)
                 nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=taken, note=note))
         if self._memory and gang.isolated:  # of a job from YAML it is for the scheduler alone
-            nodes = [replace(node, contract=self._limited(gang.name, node)) for node in nodes]
+            for index, node in enumerate(nodes):
+                group, limit = memory_group(self._memory, _group_name(gang.name, index)), node.placement.memory
+                contract = replace(node.contract, memory_group=group, memory_limit=limit)
+                nodes[index] = replace(node, contract=contract)
         return Plan(gang, nodes, [self._process(gang, node) for node in nodes])
 
     def launch(self, plan: Plan[Sequence[NodeProcess]]) -> Handle:
@@ -129,7 +130,10 @@ class LocalEngine:
             raise EngineError(f"working directory {gang.directory} is not on this machine")
         found = _shims(gang.name)
         # a node that is started late must meet the others where they are
-        port = next((shim.port for shim in found.values()), 0) or _port(gang.name)
+        try:
+            port = next((shim.port for shim in found.values()), 0) or free_port(gang.name)
+        except OSError as error:  # none is free
+            raise Transient(str(error)) from None
         run = Store(gang.store).run(gang.run)
         nodes: dict[int, dict[str, object]] = {}
         started: list[int] = []
@@ -156,8 +160,8 @@ class LocalEngine:
                 end_nodes([_processes(node) for node in nodes.values()], [f"MUSTER_GANG={gang.name}"])
                 self._forget(gang.name, list(nodes.values()))
             except OSError as trouble:  # /proc can't be read now: the next try finds what may be left
-                said = f"can't start the gang now ({error}), nor look for what is left of it ({trouble}); trying again"
-                raise Transient(said, unknown=True) from error
+                words = f"can't start the gang now ({error}), nor look for what is left of it ({trouble}); trying again"
+                raise Transient(words, unknown=True) from error
             raise
         return Handle(self.name, gang.name, len(nodes), {"nodes": [nodes[index] for index in range(len(nodes))]})
 
@@ -174,7 +178,8 @@ class LocalEngine:
         gang, nodes = handle.gang, [_processes(node) for node in handle.facts["nodes"]]
         for node in nodes:
             if shim := node.shim:
-                _signal(shim.pid, signal.SIGTERM)
+                with suppress(ProcessLookupError, PermissionError):
+                    os.kill(shim.pid, signal.SIGTERM)
         wait_until(lambda: not any((shim := node.shim) and shim.name != STUCK for node in nodes), grace, 0.02)
         # What is left now did not leave in time, or lost its supervisor: end it, and all that carries the gang's name.
         if left := end_nodes(nodes, [f"MUSTER_GANG={gang}"]):
@@ -200,32 +205,17 @@ class LocalEngine:
             except OSError:
                 pass  # it was never started, or this was done before
 
-    def _limited(self, gang: str, node: NodePlan) -> NodeContract:
-        """The contract of a node whose job has no more than its memory."""
-        group = memory_group(self._memory, _group_name(gang, node.contract.node_index))
-        return replace(node.contract, memory_group=group, memory_limit=node.placement.memory)
-
-    def _group(self, gang: str, index: int) -> str:
-        return f"{self._groups}/{_group_name(gang, index)}" if self._groups else ""
-
     def _process(self, gang: Gang, node: NodePlan) -> NodeProcess:
         own = inherited()
-        environment = {
-            **own,
-            "PATH": f"{Path(sys.executable).parent}:{own.get('PATH', '/usr/bin:/bin')}",
-            "WARP_CACHE_PATH": own.get("WARP_CACHE_PATH", str(self.home / "kernels")),
-            "CUDA_VISIBLE_DEVICES": ",".join(node.placement.gpus),
-            **sealed(node.environment, node.contract.to_env()),
-        }
-        # -P: a folder called "worker" in the job's directory must not hide ours
-        command = [sys.executable, "-P", "-m", "worker.supervisor", "--", *node.command]
+        own.setdefault("WARP_CACHE_PATH", str(self.home / "kernels"))
+        gpus = ",".join(node.placement.gpus)
+        environment = node_environment(own, gpus, node.environment, node.contract.to_env())
         index = node.contract.node_index
         container = gang.containers[index] if gang.containers else {}
-        group = self._group(gang.name, index)
+        group = f"{self._groups}/{_group_name(gang.name, index)}" if self._groups else ""
+        command = with_mounts(supervised(node.command), mounts_of(container, gang.store))
         exit_file = str(self._left(gang.name, index, "exit"))
-        whole = shimmed(
-            with_mounts(command, mounts_of(container, gang.store)), group, files=self._files, exit_file=exit_file
-        )
+        whole = shimmed(command, group, files=self._files, exit_file=exit_file)
         return NodeProcess(whole, environment, group, gang.directory)
 
     def _start(self, node: NodeProcess, port: int, gang: str, index: int, started: list[int]) -> int:
@@ -248,7 +238,7 @@ class LocalEngine:
         await_marks(process.pid)
         return process.pid
 
-    def _observe_node(self, gang: str, index: int, node: dict[str, object]) -> NodeStatus:
+    def _observe_node(self, gang: str, index: int, node: Mapping[str, object]) -> NodeStatus:
         pid, address = int(str(node["pid"])), str(node["address"])
         child = self._children.get(pid)
         code = child.poll() if child else None
@@ -257,10 +247,9 @@ class LocalEngine:
             return NodeStatus(NodePhase.RUNNING, address)
         if code is None:  # an earlier controller was its parent
             code = exit_code_in(str(self._left(gang, index, "exit")))
-        try:
+        words = ""
+        with suppress(FileNotFoundError):  # another thread has just stopped the gang
             words = self._left(gang, index, "err").read_text(errors="replace").strip().rpartition("\n")[2]
-        except FileNotFoundError:  # it said nothing, or another thread has just stopped the gang
-            words = ""
         return ended(address, None if code is None else code if code >= 0 else 128 - code, words)
 
     def _left(self, gang: str, index: int, kind: str) -> Path:
@@ -268,21 +257,21 @@ class LocalEngine:
         return self.home / "supervisors" / f"{gang.replace('/', '-')}-node-{index}.{kind}"
 
 
-def _user(given: str) -> tuple[str | None, str]:
+def _user(wish: str) -> tuple[str | None, str]:
     """``UID:GID`` of ``user`` in a job definition, where it can be taken on, and a note for the log where not all of it is.
 
     Nodes have no image, so a name that this machine does not have is the image's, and is passed over like it. One that it has is taken
     on: that gives the job no more than a controller that runs as root would have given it.
     """
-    name, _, group = given.partition(":")
+    name, _, group = wish.partition(":")
     if os.geteuid() != 0:
-        return None, unused_user(given, "the controller does not run as root")
+        return None, unused_user(wish, "the controller does not run as root")
     try:
         user = pwd.getpwuid(int(name)) if _ID.fullmatch(name) else pwd.getpwnam(name)
         uid, gid = user.pw_uid, user.pw_gid
     except KeyError:
         if not _ID.fullmatch(name):
-            return None, unused_user(given, f"this machine has no user {name}")
+            return None, unused_user(wish, f"this machine has no user {name}")
         uid = gid = int(name)
     note = ""
     try:
@@ -300,14 +289,6 @@ def _address(gang: Gang, index: int) -> str:
     """A loopback address of the node's own in 127.64.0.0/10, so that two gangs can use the same ports: 254 nodes to each /24."""
     digest = hashlib.sha256(gang.name.encode()).digest()
     return f"127.{64 + digest[0] % 63}.{(digest[1] + index // 254) % 256}.{index % 254 + 1}"
-
-
-def _port(gang: str) -> int:
-    """A port for the nodes of a gang to meet at. Raises Transient where none is free."""
-    try:
-        return free_port(gang)
-    except OSError as error:
-        raise Transient(str(error)) from None
 
 
 @dataclass(frozen=True)
@@ -341,15 +322,3 @@ def _processes(node: Mapping[str, object]) -> NodeProcesses:
     """Of a node in a handle; handles of older versions have no groups."""
     groups = (str(node.get(name) or "") for name in ("group", "memory"))
     return NodeProcesses(int(str(node["pid"])), str(node["start"]), *groups)
-
-
-def _signal(pid: int, number: int) -> None:
-    try:
-        os.kill(pid, number)
-    except (ProcessLookupError, PermissionError):
-        pass
-
-
-def _memory() -> int:
-    """Memory of the machine in MiB."""
-    return int(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**20)

@@ -7,14 +7,16 @@ import re
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
+import time
 from collections.abc import Mapping, Sequence
+from math import inf
 from pathlib import Path
 from typing import Any
 
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.toolkit.environment import INHERIT, inherited
-from orchestrator.engines.toolkit.view import View
 
 _FRESH = 8.0
 """Seconds after which the last report is stale: the head does not answer."""
@@ -27,32 +29,27 @@ class ClusterWatch:
 
     def __init__(self, head: str, environment: Mapping[str, str]) -> None:
         self.head, self._environment = head, environment
-        self._reports = View[dict[str, Any]]({})
-        self._told = threading.Event()
-        self._closing = threading.Event()
+        self.seen: dict[str, Any] = {}
+        """The last report, however old it is (see :meth:`problem`); empty before the first."""
+        self._taken = -inf
+        self._trouble = ""
+        self._first, self._closing = threading.Event(), threading.Event()
         self._process: subprocess.Popen[str] | None = None
         threading.Thread(target=self._listen, name="ray watch", daemon=True).start()
 
-    @property
-    def seen(self) -> dict[str, Any]:
-        """The last report, however old it is (see :meth:`problem`); empty before the first."""
-        return self._reports.value
-
     def first(self) -> dict[str, Any]:
-        """The first report; ``{"error": …}`` where the cluster can't be used."""
-        if not self._told.wait(_STARTING):
+        """The first report. Raises EngineError where the cluster can't be used."""
+        self._first.wait(_STARTING)
+        if not self.seen:
             self.close()
-            return {"error": f"the Ray cluster at {self.head} does not answer"}
-        if self.seen:
-            return self.seen
-        self.close()
-        return {"error": self.problem()}
+            raise EngineError(self._trouble or f"the Ray cluster at {self.head} does not answer")
+        return self.seen
 
     def problem(self) -> str:
         """Why the last report is stale: nothing is known of the cluster now."""
-        if self._reports.age < _FRESH:
+        if time.monotonic() - self._taken < _FRESH:
             return ""
-        return self._reports.trouble or f"the Ray head at {self.head} does not answer"
+        return self._trouble or f"the Ray head at {self.head} does not answer"
 
     def close(self) -> None:
         self._closing.set()
@@ -62,33 +59,30 @@ class ClusterWatch:
     def _listen(self) -> None:
         command = [sys.executable, "-P", "-m", "orchestrator.engines.ray.cluster_watch", self.head]
         while not self._closing.is_set():
-            self._process = subprocess.Popen(
-                command,
-                env=dict(self._environment),
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-            )
-            errors: list[str] = []
-            stderr = self._process.stderr
-            assert stderr is not None and self._process.stdout is not None
-            reader = threading.Thread(target=errors.extend, args=(stderr,), daemon=True)
-            reader.start()
-            for line in self._process.stdout:
-                if not line.startswith("{"):
-                    continue  # a word of Ray's own
-                said = json.loads(line)
-                if "error" in said:
-                    self._reports.missed(str(said["error"]))
-                else:
-                    self._reports.answered(said)
-                self._told.set()
-            code = self._process.wait()
-            reader.join(1.0)
-            if not self._told.is_set():
-                self._reports.missed(_why_no_watch(code, errors))
-                self._told.set()
+            with tempfile.TemporaryFile("w+") as errors:
+                self._process = subprocess.Popen(
+                    command,
+                    env=dict(self._environment),
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=errors,
+                    text=True,
+                )
+                assert self._process.stdout is not None
+                for line in self._process.stdout:
+                    if not line.startswith("{"):
+                        continue  # a word of Ray's own
+                    report = json.loads(line)
+                    if "error" in report:
+                        self._trouble = str(report["error"])
+                    else:
+                        self.seen, self._taken, self._trouble = report, time.monotonic(), ""
+                    self._first.set()
+                code = self._process.wait()
+                if not self._first.is_set():
+                    errors.seek(0)
+                    self._trouble = _why_no_watch(code, errors.readlines())
+                    self._first.set()
             self._closing.wait(2.0)
 
 

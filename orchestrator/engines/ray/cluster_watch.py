@@ -12,6 +12,7 @@ import platform
 import select
 import socket
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 import ray
@@ -33,7 +34,7 @@ def check(address: str) -> None:
             f"no Ray head answers at {address} ({error.strerror or error}); set RAY_ADDRESS to its host:port"
         ) from error
     try:
-        told = GcsClient(address=address).internal_kv_get(b"CLUSTER_METADATA", b"cluster", timeout=10)
+        metadata = GcsClient(address=address).internal_kv_get(b"CLUSTER_METADATA", b"cluster", timeout=10)
     except ray.exceptions.AuthenticationError as error:
         mode = os.environ.get("RAY_AUTH_MODE")
         ours = "another one is set here" if mode == "token" else "none is set here"
@@ -41,8 +42,8 @@ def check(address: str) -> None:
             f"the Ray cluster at {address} wants its token, and {ours}: RAY_AUTH_MODE=token with RAY_AUTH_TOKEN_PATH or RAY_AUTH_TOKEN"
         ) from error
     except Exception as error:
-        raise NotUsable(f"{address} is no Ray head, or a sick one ({str(error).strip().splitlines()[0]})") from error
-    cluster = json.loads(told or b"{}")
+        raise NotUsable(f"{address} is not a healthy Ray head ({str(error).strip().splitlines()[0]})") from error
+    cluster = json.loads(metadata or b"{}")
     python = platform.python_version()
     theirs = cluster.get("ray_version"), str(cluster.get("python_version")).rpartition(".")[0]
     if theirs != (ray.__version__, python.rpartition(".")[0]):
@@ -52,7 +53,7 @@ def check(address: str) -> None:
         )
 
 
-def look(state: GlobalState) -> dict[str, Any]:
+def report(state: GlobalState) -> dict[str, Any]:
     """The cluster as it is."""
     draining = state.get_draining_nodes()
     nodes = [
@@ -61,10 +62,8 @@ def look(state: GlobalState) -> dict[str, Any]:
             "name": node["NodeName"] or node["NodeManagerAddress"],
             "address": node["NodeManagerAddress"],
             "port": node["NodeManagerPort"],
-            "cpus": node["Resources"].get("CPU", 0.0),
-            "gpus": int(node["Resources"].get("GPU", 0.0)),
-            "memory": int(node["Resources"].get("memory", 0.0) / 2**20),
             "head": "node:__internal_head__" in node["Resources"],
+            **_shape(node["Resources"]),
         }
         for node in state.node_table()
         if node["Alive"] and node["NodeID"] not in draining
@@ -73,16 +72,15 @@ def look(state: GlobalState) -> dict[str, Any]:
     # best a node that was made for it (`--num-cpus 0`), and not the head, whose end would be that of the drivers
     here.sort(key=lambda node: (node["cpus"] > 0, node["head"], node["address"]))
     config = state.get_cluster_config()
-    grows = [
-        {
-            "cpus": group.resources.get("CPU", 0.0),
-            "gpus": int(group.resources.get("GPU", 0.0)),
-            "memory": int(group.resources.get("memory", 0.0) / 2**20),
-            "most": group.max_count,
-        }
-        for group in (config.node_group_configs if config else ())
-    ]
+    groups = config.node_group_configs if config else ()
+    grows = [{**_shape(group.resources), "most": group.max_count} for group in groups]
     return {"nodes": nodes, "grows": grows, "join": here[0]["address"] if here else None}
+
+
+def _shape(resources: Mapping[str, float]) -> dict[str, float]:
+    """CPUs, GPUs and memory [MiB]."""
+    memory = int(resources.get("memory", 0.0) / 2**20)
+    return {"cpus": resources.get("CPU", 0.0), "gpus": int(resources.get("GPU", 0.0)), "memory": memory}
 
 
 def _is_here(address: str, port: int) -> bool:
@@ -104,7 +102,7 @@ def main(address: str) -> int:
         state = GlobalState()
         state._initialize_global_state(GcsClientOptions.create(address, None, True, False))
         while True:
-            print(json.dumps(look(state)), flush=True)
+            print(json.dumps(report(state)), flush=True)
             if select.select([sys.stdin], [], [], 1.0)[0]:
                 return 0
     except NotUsable as error:

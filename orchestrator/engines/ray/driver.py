@@ -1,10 +1,10 @@
 """The driver of a job on a Ray cluster: a process of its own that holds the placement group and one actor a node.
 
 ``python -m orchestrator.engines.ray.driver FOLDER JOIN FD``. It outlives the controller, takes commands from the folder's pipe
-and tells in state files how the nodes are (:mod:`orchestrator.engines.ray.folder`). When a gang is over it keeps the placement group
+and reports the nodes in state files (:mod:`orchestrator.engines.ray.folder`). When a gang is over it keeps the placement group
 for a while: the job's next attempt finds its place, its GPUs and a driver that knows the cluster. On SIGTERM, which comes where its machine
-shuts down, it has the gang save and leave; a gang that was not started is left to the next driver. Ray is imported here and nowhere else
-but in the watch, so that nothing that it does to a process that loses its cluster is done to the controller.
+shuts down, it has the gang save and leave; a gang that was not started is left to the next driver. Ray is imported here and
+in the watch alone, so that what it does to a process that loses its cluster does not happen to the controller.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import sys
 import threading
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +40,9 @@ _JOINING = 90.0
 class Driver:
     """Gangs of one job, one after the other, and the placement group that they share."""
 
-    def __init__(self, folder: Folder, join: str, commands: int) -> None:
-        self.folder, self.join, self.commands = folder, join, commands
+    def __init__(self, folder: Folder, commands: int) -> None:
+        """``commands``: descriptor of the folder's pipe, from which it reads."""
+        self.folder, self.commands = folder, commands
         self.gang: DrivenGang | None = None
         self.group: Any = None
         self.key: Any = None
@@ -50,15 +51,15 @@ class Driver:
         self._partial = b""
         self._draining: set[str] = set()
         self._leaves = False
-        self._next_look = 0.0
+        self._next_check = 0.0
 
     def run(self) -> None:
         """Until the job has been over for a while."""
-        while not self._obey():
+        while not self.obey():
             self.folder.alive.touch()
-            gang = self.gang
+            gang, idle = self.gang, time.monotonic() - self.idle_since
             if gang is None or gang.phase == "stopped":
-                if self._leaves or time.monotonic() - self.idle_since > _LINGER:
+                if self._leaves or idle > _LINGER:
                     return
                 self._read(0.2)
                 continue
@@ -66,14 +67,12 @@ class Driver:
                 gang.forget()
                 return
             self._step(gang)
-            gang.tell()
-            if gang.is_over and gang.phase != "stopping":
-                # or nobody asks: the controller is gone for long
-                if self._leaves or time.monotonic() - self.idle_since > 4 * _LINGER:
-                    gang.clear()
-                    gang.tell()
-            else:
+            if not gang.is_over or gang.phase == "stopping":
                 self.idle_since = time.monotonic()
+            elif self._leaves or idle > 4 * _LINGER:  # nobody asks: the controller has been gone for long
+                gang.tell()
+                gang.clear()
+            gang.tell()
 
     def _step(self, gang: DrivenGang) -> None:
         if gang.phase == "joining":
@@ -98,21 +97,21 @@ class Driver:
 
     def _place(self, gang: DrivenGang) -> None:
         """Keep the placement group of the attempt before where it fits, else ask for another."""
-        bundles = [bundle_of(node) for node in gang.plan["nodes"]]
-        pins = [node["pin"] for node in gang.plan["nodes"]]
-        key = (bundles, pins)
+        nodes = gang.plan["nodes"]
+        key = [bundle_of(node) for node in nodes], [node["pin"] for node in nodes]
         if self.group is not None and (key != self.key or not self.group.wait(0.5)):
-            ray.util.remove_placement_group(self.group)
-            self.group = None
+            self._let_go()
         if self.group is None:
-            selectors = [selector_of(node) for node in gang.plan["nodes"]]
             # names have to be unique, and a dead driver's group stays until Ray has noticed its death
             name = f"muster {gang.name} {uuid.uuid4().hex[:8]}"
-            self.group = ray.util.placement_group(
-                bundles, strategy=STRATEGY, name=name, bundle_label_selector=selectors
-            )
+            selectors = [selector_of(node) for node in nodes]
+            self.group = ray.util.placement_group(key[0], STRATEGY, name, bundle_label_selector=selectors)
             self.key = key
         gang.phase, gang.why = "placing", "waits for its placement group"
+
+    def _let_go(self) -> None:
+        ray.util.remove_placement_group(self.group)
+        self.group = None
 
     def _await_place(self, gang: DrivenGang) -> None:
         if self.group.wait(0.1):
@@ -120,10 +119,10 @@ class Driver:
             for index, node in enumerate(gang.nodes):
                 node["ray_node"] = where[index]
             gang.place(self.group)
-        elif time.monotonic() > self._next_look:
-            self._next_look = time.monotonic() + 1.0
-            there = {node["NodeID"] for node in ray.nodes() if node["Alive"]}
-            if gone := [node for node in gang.plan["nodes"] if node["pin"] and node["pin"] not in there]:
+        elif time.monotonic() > self._next_check:
+            self._next_check = time.monotonic() + 1.0
+            alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}
+            if gone := [node for node in gang.plan["nodes"] if node["pin"] and node["pin"] not in alive]:
                 for node in gone:  # any other machine that has room will do
                     node["pin"] = None
                 self._place(gang)
@@ -133,47 +132,40 @@ class Driver:
         """SIGTERM: see the module."""
         self._leaves = True
 
-    def _obey(self) -> bool:
+    def obey(self) -> bool:
         """Carry out the commands that have come; True where the driver should leave."""
         self._read(0.0)
-        while b"\n" in self._partial:
-            line, _, self._partial = self._partial.partition(b"\n")
+        *lines, self._partial = self._partial.split(b"\n")
+        for line in lines:
             try:
                 command = json.loads(line)
             except ValueError:
                 continue
-            idle = self.gang is None or self.gang.phase == "stopped"
-            if command["do"] == "leave" and idle:
-                return True
-            if command["do"] == "run" and idle:
-                self.take(command["gang"])
-            elif command["do"] == "stop" and self.gang is not None and command["gang"] == self.gang.name:
-                self._stop(self.gang, command["grace"])
+            gang = self.gang
+            if gang is None or gang.phase == "stopped":
+                if command["do"] == "leave":
+                    return True
+                if command["do"] == "run":
+                    self._take(command["gang"])
+            elif command["do"] == "stop" and command["gang"] == gang.name:
+                if gang.phase == "placing":  # it asks for machines that nobody needs any more
+                    self._let_go()
+                if gang.phase != "stopping":
+                    gang.stop(command["grace"])
         return False
 
-    def _stop(self, gang: DrivenGang, grace: float) -> None:
-        if gang.phase == "placing":  # it asks for machines that nobody wants any more
-            ray.util.remove_placement_group(self.group)
-            self.group = None
-        if gang.phase not in ("stopping", "stopped"):
-            gang.stop(grace)
-
-    def take(self, name: str) -> None:
+    def _take(self, name: str) -> None:
         """Begin with the gang of that name, unless it was here already."""
         if self.folder.state(name).exists():
             return
-        try:
+        with contextlib.suppress(OSError):  # it was stopped meanwhile
             self.gang = DrivenGang(json.loads(self.folder.plan(name).read_bytes()), self.folder)
-        except OSError:
-            return  # it was stopped meanwhile
-        self.gang.tell()
+            self.gang.tell()
 
     def _read(self, seconds: float) -> None:
         if select.select([self.commands], [], [], seconds)[0]:
-            try:
+            with contextlib.suppress(BlockingIOError):
                 self._partial += os.read(self.commands, 65536)
-            except BlockingIOError:
-                pass
 
     def watch(self) -> None:
         """In a thread, since it waits where the head is away: which nodes are told to leave."""
@@ -188,66 +180,62 @@ def _why_waiting(nodes: list[Mapping[str, Any]]) -> str:
     free = ray._private.state.available_resources_per_node()
     full, new = [], []
     for node in nodes:
-        wanted = bundle_of(node)
         if node["pin"] not in free:
             new.append(node)
-        elif any(free[node["pin"]].get(name, 0.0) < amount for name, amount in wanted.items()):
+        elif any(free[node["pin"]].get(name, 0.0) < amount for name, amount in bundle_of(node).items()):
             full.append(node["host"])
     if full:
         return f"waits for room on {', '.join(full)}: other work of the Ray cluster holds it"
-    if new:
-        gpus = f", {new[0]['gpus']} GPUs" if new[0]["gpus"] else ""
-        shape = f"{new[0]['cpus']:g} CPUs{gpus}, {new[0]['memory']} MiB"
-        if gone := [node["host"] for node in new if not node["host"].startswith(NEW)]:
-            return f"waits for {', '.join(gone)} to come back to the Ray cluster, or for another node with {shape}"
-        return f"waits for {len(new)} more node{'s' if len(new) > 1 else ''} with {shape}: Ray's autoscaler was asked"
-    return "waits for its placement group"
+    if not new:
+        return "waits for its placement group"
+    gpus = f", {new[0]['gpus']} GPUs" if new[0]["gpus"] else ""
+    shape = f"{new[0]['cpus']:g} CPUs{gpus}, {new[0]['memory']} MiB"
+    if gone := [node["host"] for node in new if not node["host"].startswith(NEW)]:
+        return f"waits for {', '.join(gone)} to come back to the Ray cluster, or for another node with {shape}"
+    return f"waits for {len(new)} more node{'s' if len(new) > 1 else ''} with {shape}: Ray's autoscaler was asked"
 
 
 def main(argv: list[str]) -> int:
     """Join the cluster through this machine's Ray node, then drive."""
     folder, join, commands = Folder(Path(argv[0])), argv[1], int(argv[2])
     os.set_inheritable(commands, False)
-    driver = Driver(folder, join, commands)
-    driver._obey()
-    gang = driver.gang
+    driver = Driver(folder, commands)
+    driver.obey()
+    gang, head = driver.gang, os.environ["RAY_ADDRESS"]
     if gang is None:
         return 0
 
-    def give_up() -> None:
-        gang.fail(f"the Ray cluster at {os.environ['RAY_ADDRESS']} let nobody join for {_JOINING:.0f} s")
+    def give_up(why: str) -> None:
+        gang.fail(why)
         gang.tell()
         os._exit(1)
 
-    patience = threading.Timer(_JOINING, give_up)
-    patience.daemon = True
-    patience.start()
+    late = f"the Ray cluster at {head} let nobody join for {_JOINING:.0f} s"
+    patience = _timer(_JOINING, give_up, late)
     try:
         ray.cloudpickle.register_pickle_by_value(ray_node)
-        ray.init(
-            address=os.environ["RAY_ADDRESS"],
-            namespace="muster",
-            log_to_driver=False,
-            logging_level="error",
-            _node_ip_address=join,
-        )
+        quiet = {"log_to_driver": False, "logging_level": "error"}
+        ray.init(address=head, namespace="muster", _node_ip_address=join, **quiet)
     except SystemExit:  # SIGTERM: until then Ray's own handler has it
         gang.forget()
         return 0
     except Exception as error:
-        gang.fail(f"can't join the Ray cluster at {os.environ['RAY_ADDRESS']}: {str(error).strip().splitlines()[0]}")
-        gang.tell()
-        return 1
+        give_up(f"can't join the Ray cluster at {head}: {str(error).strip().splitlines()[0]}")
     patience.cancel()
     signal.signal(signal.SIGTERM, driver.leave)
     threading.Thread(target=driver.watch, name="watch", daemon=True).start()
     driver.run()
     # leaving, it must not wait for a head that is away; what it holds goes with it
-    escape = threading.Timer(10.0, os._exit, (0,))
-    escape.daemon = True
-    escape.start()
+    _timer(10.0, os._exit, 0)
     ray.shutdown()
     return 0
+
+
+def _timer(seconds: float, body: Callable[..., None], argument: object) -> threading.Timer:
+    timer = threading.Timer(seconds, body, (argument,))
+    timer.daemon = True
+    timer.start()
+    return timer
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,10 @@ from orchestrator.engines.api import (
 from orchestrator.engines.ray import TRAITS
 from orchestrator.engines.ray.cluster import ClusterWatch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray.folder import LEASE, NEW, UNSTARTED, Folder
-from orchestrator.engines.ray.placement_groups import in_words
-from orchestrator.engines.ray.request import GangRequest, NodeRequest
-from orchestrator.engines.toolkit.endings import ended
-from orchestrator.engines.toolkit.looks import one_by_one
+from orchestrator.engines.ray.placement_groups import GangRequest, NodeRequest, in_words
+from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
-from orchestrator.engines.toolkit.stopping import stop_within
+from orchestrator.engines.toolkit.waiting import stop_within
 from shared_store.process.ports import first_port
 from shared_store.volume.files import read_json, write_json
 
@@ -84,10 +83,7 @@ class RayEngine:
         self._grows = grows_to(os.environ.get("MUSTER_RAY_GROWS_TO", ""))
         self._environment = ray_environment(self.head)
         self._watch = ClusterWatch(self.head, self._environment)
-        seen = self._watch.first()
-        if "error" in seen:
-            raise EngineError(str(seen["error"]))
-        if not seen["join"]:
+        if not self._watch.first()["join"]:
             self._watch.close()
             raise EngineError(_not_a_node(self.head))
         self.address = address_towards(self.head)
@@ -109,29 +105,22 @@ class RayEngine:
 
         One that was added for a gang is called what the gang's placement calls it until that is over.
 
-        Raises NotYet while the head does not answer: what it said before may be wrong.
+        Raises NotYet while the head does not answer: its last answer may be wrong.
         """
         if problem := self._watch.problem():
             raise NotYet(problem)
         machines = self._machines()
-        hosts = [Host(name, m["cpus"], _ids(m["gpus"]), m["memory"], single=True) for name, m in machines.items()]
+        free = (name for number in count(1) if (name := f"{NEW}{number}") not in machines)
+        hosts = [_host(name, machine) for name, machine in machines.items()]
         for shape in [*self._grows, *self._watch.seen.get("grows", [])]:
             like = [m for m in machines.values() if (m["cpus"], m["gpus"]) == (shape["cpus"], shape["gpus"])]
-            names = (f"{NEW}{number}" for number in range(1, 10_000))
-            taken = {host.name for host in hosts}
-            free = (name for name in names if name not in taken)
-            for _ in range(shape["most"] - len(like)):
-                hosts.append(Host(next(free), shape["cpus"], _ids(shape["gpus"]), shape["memory"], single=True))
+            hosts += [_host(next(free), shape) for _ in range(shape["most"] - len(like))]
         return Hosts(hosts)
 
     def _machines(self) -> dict[str, dict[str, Any]]:
         """The cluster's machines that have CPUs, by host name."""
-        now = time.monotonic()
-        nodes = [
-            node
-            for node in self._watch.seen.get("nodes", [])
-            if node["cpus"] > 0 and self._suspects.get(node["id"], 0.0) < now
-        ]
+        now, nodes = time.monotonic(), self._watch.seen.get("nodes", [])
+        nodes = [node for node in nodes if node["cpus"] > 0 and self._suspects.get(node["id"], 0.0) < now]
         names = [node["name"] for node in nodes]
         taken = self._taken()
         found = {}
@@ -146,7 +135,7 @@ class RayEngine:
         with self._lock:
             grown = list(self._grown.items())
         for gang, hosts in grown:
-            state = read_json(Folder.of(self.home, _job(gang)).state(gang)) or {}
+            state = read_json(Folder.of(self.home, gang).state(gang)) or {}
             for host, node in zip(hosts, state.get("nodes", ()), strict=False):
                 if host.startswith(NEW) and node["ray_node"]:
                     names[node["ray_node"]] = host
@@ -160,19 +149,18 @@ class RayEngine:
         addresses = [machines[p.host]["address"] if p.host in machines else "" for p in gang.placements]
         nodes = node_plans(gang, addresses, first_port(gang.name))
         request = GangRequest(gang.name, gang.main, gang.directory, [_request(gang, node, machines) for node in nodes])
-        return Plan(gang, nodes, request, in_words(request.told()))
+        return Plan(gang, nodes, request, in_words(request.document()))
 
     def launch(self, plan: Plan[GangRequest]) -> Handle:
         gang = plan.gang
         folder = Folder.of(self.home, gang.job)
         hosts = [placement.host for placement in gang.placements]
         if not folder.state(gang.name).exists():
-            if problem := self._watch.problem():
+            problem = self._watch.problem() or ("" if self._watch.seen["join"] else _not_a_node(self.head))
+            if problem:
                 raise NotYet(f"{problem}; waiting for it")
-            if not self._watch.seen["join"]:
-                raise NotYet(f"{_not_a_node(self.head)}; waiting for it")
             folder.make()
-            write_json(folder.plan(gang.name), plan.request.told())
+            write_json(folder.plan(gang.name), plan.request.document())
             folder.plan(gang.name).chmod(0o600)
             self._let_go(gang.job)
             self._drive(folder, gang.name)
@@ -184,38 +172,34 @@ class RayEngine:
         return one_by_one(self._observe, handles)
 
     def _observe(self, handle: Handle) -> GangStatus:
-        gang, count = handle.gang, handle.nodes
-        folder = Folder.of(self.home, _job(gang))
+        gang, size, folder = handle.gang, handle.nodes, Folder.of(self.home, handle.gang)
         state = read_json(folder.state(gang))
         if state is None or state["phase"] != "stopped":
             self._note(handle)
         if state is None:
-            if folder.plan(gang).exists():
-                driver = self._drivers.get(_job(gang))
-                if driver is not None and driver.poll():  # one that left with 0 did so before it was asked
-                    return [ended("", 1, f"its driver can't run: {folder.last_line()}")] * count
-                self._drive(folder, gang)
-                return [NodeStatus(NodePhase.STARTING, words="its driver is starting")] * count
-            return [ended("", None)] * count
-        driven = folder.is_driven() or state["phase"] == "stopped"
+            if not folder.plan(gang).exists():
+                return [ended("", None)] * size
+            driver = self._drivers.get(folder.path.name)
+            if driver is not None and driver.poll():  # one that left with 0 did so before it was asked
+                return [ended("", 1, f"its driver can't run: {folder.last_line()}")] * size
+            self._drive(folder, gang)
+            return [NodeStatus(NodePhase.STARTING, words="its driver is starting")] * size
+        driven = folder.send() or state["phase"] == "stopped"
         if not driven:  # its last words may have come in between
             state = read_json(folder.state(gang)) or state
             if state["phase"] in UNSTARTED and any(node["running"] for node in state["nodes"]):
                 return self._drive_again(folder, handle, state)
         if state["phase"] == "placing" and time.monotonic() > self._next_let_go:
             self._next_let_go = time.monotonic() + 1.0
-            self._let_go(_job(gang))
-        status = []
+            self._let_go(folder.path.name)
         for node in state["nodes"]:
-            status.append(_status(node, state, driven))
             if driven and state["phase"] == "running" and not node["running"] and node["code"] is None:
                 until = time.monotonic() + (_SUSPECT_IF_SILENT if node.get("silent") else _SUSPECT)
                 self._suspects.setdefault(node["ray_node"], until)
-        return status
+        return [_status(node, state, driven) for node in state["nodes"]]
 
     def stop(self, handle: Handle, grace: float) -> None:
-        gang = handle.gang
-        folder = Folder.of(self.home, _job(gang))
+        gang, folder = handle.gang, Folder.of(self.home, handle.gang)
         asked, patience = 0.0, time.monotonic() + grace + 2 * LEASE
 
         def step() -> str:
@@ -234,7 +218,7 @@ class RayEngine:
                 asked = now
                 if not folder.send({"do": "stop", "gang": gang, "grace": grace}):
                     self._outwait(folder, gang)
-            return f"its driver says {phase}" if phase else "its driver has said nothing yet"
+            return f"its driver reports {phase}" if phase else "its driver has reported nothing yet"
 
         stop_within(grace + _ENDING, step, engine=self.name, gang=gang, pause=0.02)
         self._tries.pop(gang, None)
@@ -267,19 +251,20 @@ class RayEngine:
         if folder.send({"do": "run", "gang": gang}):
             return
         folder.alive.unlink(missing_ok=True)
-        commands = folder.read_end()
-        job = _job(gang)
+        # it reads, and never sees the pipe's end; the driver is born with it
+        commands = os.open(folder.pipe, os.O_RDWR | os.O_NONBLOCK)
+        job = folder.path.name
         command = [sys.executable, "-P", "-m", "orchestrator.engines.ray.driver", str(folder.path)]
         try:
-            with open(folder.said, "ab") as said:
+            with open(folder.errors, "ab") as errors:
                 self._drivers[job] = subprocess.Popen(
                     [*command, str(self._watch.seen.get("join")), str(commands)],
                     env={**self._environment, "MUSTER_JOB_ID": job, "MUSTER_STORE": str(self.home)},
                     pass_fds=(commands,),
                     cwd=folder.path,  # Ray has workers look for modules where their driver was started
                     stdin=subprocess.DEVNULL,
-                    stdout=said,
-                    stderr=said,
+                    stdout=errors,
+                    stderr=errors,
                     start_new_session=True,
                 )
             folder.send({"do": "run", "gang": gang})
@@ -298,9 +283,7 @@ class RayEngine:
 
     def _let_go(self, job: str) -> None:
         """Ask drivers that only hold resources for another job's next attempt to exit, and reap those that have."""
-        for other, process in list(self._drivers.items()):
-            if process.poll() is not None:
-                del self._drivers[other]
+        self._drivers = {name: process for name, process in self._drivers.items() if process.poll() is None}
         for path in (self.home / "ray").glob("*"):
             if path.name != job:
                 Folder(path).send({"do": "leave"})
@@ -308,7 +291,7 @@ class RayEngine:
     def _clear_away(self) -> None:
         """Remove the folders of jobs that have long been over."""
         for path in (self.home / "ray").glob("*"):
-            if time.time() - path.stat().st_mtime > _KEPT and not Folder(path).is_driven():
+            if time.time() - path.stat().st_mtime > _KEPT and not Folder(path).send():
                 shutil.rmtree(path, ignore_errors=True)
 
 
@@ -346,15 +329,12 @@ def _status(node: Mapping[str, Any], state: Mapping[str, Any], driven: bool) -> 
 
 def _not_a_node(head: str) -> str:
     return (
-        f"this machine is no node of the Ray cluster at {head}, and drivers run on one: "
+        f"this machine is not a node of the Ray cluster at {head}, and drivers run on one: "
         f"`ray start --address={head} --num-cpus=0` makes it one"
     )
 
 
-def _ids(count: int) -> tuple[str, ...]:
+def _host(name: str, shape: Mapping[str, Any]) -> Host:
     """Ray says which GPUs a node gets; until then they have numbers."""
-    return tuple(str(number) for number in range(count))
-
-
-def _job(gang: str) -> str:
-    return gang.partition("/")[0]
+    gpus = tuple(str(number) for number in range(shape["gpus"]))
+    return Host(name, shape["cpus"], gpus, shape["memory"], single=True)

@@ -1,6 +1,6 @@
 """The folder of a Ray job, ``$MUSTER_HOME/ray/<job>/``: files and a named pipe with messages between the engine and the job's driver.
 
-The driver outlives the controller. Whoever finds a reader at the pipe's other end has found it; what it knows is in its state files.
+The driver outlives the controller. A reader at the pipe's other end is the driver; its state files hold what it knows.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ class Folder:
     """One job's folder."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
-        self.pipe = path / "commands"
-        self.said = path / "driver.err"
+        self.path, self.pipe = path, path / "commands"
+        self.errors = path / "driver.err"
         self.alive = path / "alive"
         """Touched by the driver every second."""
 
     @classmethod
-    def of(cls, home: Path, job: str) -> Folder:
-        return cls(home / "ray" / job)
+    def of(cls, home: Path, gang: str) -> Folder:
+        """That of the job of a gang ``<job>/<attempt>/<epoch>``, or of a job."""
+        return cls(home / "ray" / gang.partition("/")[0])
 
     def make(self) -> None:
         """Make the folder, for its owner only (plans hold the job's environment), and the pipe."""
@@ -46,12 +46,8 @@ class Folder:
             with contextlib.suppress(FileExistsError):
                 os.mkfifo(self.pipe, 0o600)
 
-    def read_end(self) -> int:
-        """A descriptor of the pipe that reads, and that never sees its end; a driver is born with one."""
-        return os.open(self.pipe, os.O_RDWR | os.O_NONBLOCK)
-
-    def send(self, command: Mapping[str, Any]) -> bool:
-        """Tell the driver; False where there is none. One that is too busy to read is one that is there."""
+    def send(self, command: Mapping[str, Any] | None = None) -> bool:
+        """Tell the driver; returns whether there is one. One that is too busy to read is one that is there. Raises OSError."""
         try:
             descriptor = os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK)
         except OSError as error:
@@ -59,34 +55,24 @@ class Folder:
                 return False
             raise
         try:
-            os.write(descriptor, json.dumps(command).encode() + b"\n")
+            if command is not None:
+                os.write(descriptor, json.dumps(command).encode() + b"\n")
         except BlockingIOError:
             pass
         finally:
             os.close(descriptor)
         return True
 
-    def is_driven(self) -> bool:
-        """Whether the job's driver is there. Raises OSError where that can't be told now."""
-        try:
-            os.close(os.open(self.pipe, os.O_WRONLY | os.O_NONBLOCK))
-            return True
-        except OSError as error:
-            if error.errno in (errno.ENXIO, errno.ENOENT):
-                return False
-            raise
-
     def last_line(self) -> str:
         """The last line that a driver of the job wrote before it ended."""
-        return self.said.read_text(errors="replace").strip().rpartition("\n")[2] if self.said.exists() else ""
+        return self.errors.read_text(errors="replace").strip().rpartition("\n")[2] if self.errors.exists() else ""
 
     def plan(self, gang: str) -> Path:
-        return self.path / f"{_file_name(gang)}.plan.json"
+        """``<attempt>-<epoch>.plan.json``."""
+        return self._file(gang, "plan")
 
     def state(self, gang: str) -> Path:
-        return self.path / f"{_file_name(gang)}.state.json"
+        return self._file(gang, "state")
 
-
-def _file_name(gang: str) -> str:
-    """``<attempt>-<epoch>``, of ``<job>/<attempt>/<epoch>``."""
-    return gang.partition("/")[2].replace("/", "-")
+    def _file(self, gang: str, kind: str) -> Path:
+        return self.path / f"{gang.partition('/')[2].replace('/', '-')}.{kind}.json"

@@ -1,4 +1,4 @@
-"""A gang on a Ray cluster, as its driver has it: an actor on each node, what was asked of it, and how the node is."""
+"""A gang on a Ray cluster, as its driver has it: an actor on each node, the calls that are not answered, and the state of the nodes."""
 
 from __future__ import annotations
 
@@ -38,29 +38,34 @@ class DrivenGang:
     def __init__(self, plan: Mapping[str, Any], folder: Folder) -> None:
         self.plan, self.folder = plan, folder
         self.name: str = plan["gang"]
+        self.contracts = [_contract(node["contract"]) for node in plan["nodes"]]
         self.phase, self.why = "joining", "joining the Ray cluster"
         self.placings = 0
         """How often it was placed."""
-        self.nodes = self._unplaced()
+        self.deadline = self._next_beat = 0.0
+        """When a stop has to be done with, and when the next signs of life are due [monotonic s]."""
+        self._told: dict[str, Any] = {}
+        """The state file's content."""
+        self._unplace()
+
+    def _unplace(self) -> None:
+        fresh = {"running": True, "started": False, "address": "", "gpus": "", "code": None, "detail": ""}
+        self.nodes: list[dict[str, Any]] = [{**fresh, "ray_node": node["pin"] or ""} for node in self.plan["nodes"]]
         self.actors: list[Any] = []
         self.asked: dict[Any, tuple[str, int]] = {}
         """Calls of actors that are not answered: a kind and a node's index."""
         self.heard = [time.monotonic()] * len(self.nodes)
-        self.left: set[int] = set()
+        self.leaving: set[int] = set()
         """Indices of nodes that were told to leave."""
         self.broken: dict[int, float] = {}
         """Since when the connection to an actor is broken."""
-        self.next_beat = 0.0
-        self.deadline = 0.0
-        """When a stop has to be done with [monotonic s]."""
-        self.told: dict[str, Any] = {}
 
     def tell(self) -> None:
         """Write the state file where something changed."""
         state = {"gang": self.name, "driver": os.getpid(), "phase": self.phase, "why": self.why, "nodes": self.nodes}
-        if state != self.told:
+        if state != self._told:
             write_json(self.folder.state(self.name), state)
-            self.told = json.loads(json.dumps(state))
+            self._told = json.loads(json.dumps(state))
 
     @property
     def lost(self) -> set[int]:
@@ -87,51 +92,38 @@ class DrivenGang:
         for index in range(len(self.nodes)):
             self.end(index, 1, detail)
 
-    def _unplaced(self) -> list[dict[str, Any]]:
-        return [
-            {
-                "running": True,
-                "started": False,
-                "address": "",
-                "gpus": "",
-                "code": None,
-                "detail": "",
-                "ray_node": node["pin"] or "",
-            }
-            for node in self.plan["nodes"]
-        ]
-
     def place_again(self) -> None:
         """Have the gang placed anew: an actor was lost before any command was started, so the attempt has not begun."""
         lost = min(self.lost)
-        self.why = (
-            f"node {lost} on {self.plan['nodes'][lost]['host']}: {self.nodes[lost]['detail']}; it is placed again"
-        )
-        for actor in self.actors:
-            ray.kill(actor)
-        self.nodes, self.actors, self.asked, self.broken = self._unplaced(), [], {}, {}
-        self.phase = "joining"
+        host, detail = self.plan["nodes"][lost]["host"], self.nodes[lost]["detail"]
+        self.phase, self.why = "joining", f"node {lost} on {host}: {detail}; it is placed again"
+        self._kill_actors()
+        self._unplace()
+
+    def _ask(self, kind: str, index: int, *arguments: Any) -> Any:
+        """Call a method of a node's actor; :meth:`listen` takes the answer."""
+        reference = getattr(self.actors[index], kind).remote(*arguments)
+        self.asked[reference] = (kind, index)
+        return reference
 
     def place(self, group: Any) -> None:
         """Actors on the bundles of a placement group that has its room."""
         self.placings += 1
-        actor = ray.remote(ray_node.Node)
         for index, node in enumerate(self.plan["nodes"]):
             bundle = bundle_of(node)
-            strategy = PlacementGroupSchedulingStrategy(group, placement_group_bundle_index=index)
-            self.actors.append(
-                actor.options(
-                    num_cpus=bundle["CPU"],
-                    num_gpus=bundle.get("GPU", 0),
-                    memory=bundle["memory"],
-                    scheduling_strategy=strategy,
-                    max_concurrency=6,
-                ).remote({"MUSTER_GANG": self.name, "NODE_RANK": str(_contract(node["contract"]).node_rank)}, LEASE)
+            actor = ray.remote(ray_node.Node).options(
+                num_cpus=bundle["CPU"],
+                num_gpus=bundle.get("GPU", 0),
+                memory=bundle["memory"],
+                scheduling_strategy=PlacementGroupSchedulingStrategy(group, placement_group_bundle_index=index),
+                max_concurrency=6,
             )
-        contract = _contract(self.plan["nodes"][0]["contract"])
+            marks = {"MUSTER_GANG": self.name, "NODE_RANK": str(self.contracts[index].node_rank)}
+            self.actors.append(actor.remote(marks, LEASE))
+        contract = self.contracts[0]
         about = self.plan["directory"], contract.store, contract.run, contract.epoch, self.name
-        for index, node in enumerate(self.actors):
-            self.asked[node.facts.remote(__version__, *about)] = ("facts", index)
+        for index in range(len(self.actors)):
+            self._ask("facts", index, __version__, *about)
         self.heard = [time.monotonic()] * len(self.nodes)
         self.phase, self.why = "starting", "starting an actor on each node"
 
@@ -144,92 +136,76 @@ class DrivenGang:
             return
         self.phase, self.why = "running", ""
         self.tell()  # before it starts anything: the engine starts a gang again if it finds an earlier phase
+        meeting = {"master_address": addresses[main], "master_port": port}
         for index in sorted(range(len(self.nodes)), key=lambda index: index != main):
             node = self.plan["nodes"][index]
-            contract = dataclasses.replace(
-                _contract(node["contract"]),
-                address=addresses[index],
-                master_address=addresses[main],
-                master_port=port,
-            )
-            ref = self.actors[index].start.remote(
-                node["prefix"],
-                node["command"],
-                node["environment"],
-                contract.to_env(),
-                node["gpus"],
-                self.plan["directory"],
-                named_variables(),
-            )
-            self.asked[ref] = ("start", index)
+            contract = dataclasses.replace(self.contracts[index], address=addresses[index], **meeting)
+            order = node["prefix"], node["command"], node["environment"], contract.to_env(), node["gpus"]
+            started = self._ask("start", index, *order, self.plan["directory"], named_variables())
             self.nodes[index]["address"] = addresses[index]
             if index == main:
-                ray.wait([ref], timeout=LEASE)
+                ray.wait([started], timeout=LEASE)
 
     def stop(self, grace: float) -> None:
         """Ask every node that can be reached to end; :meth:`listen` notes when they have."""
         self.phase, self.why, self.deadline = "stopping", "", time.monotonic() + grace + _ENDING
-        lost = self.lost
-        self.asked = {ref: told for ref, told in self.asked.items() if told[1] not in lost}
-        for index, actor in enumerate(self.actors):
-            if index not in lost:  # nobody is there to answer
-                self.asked[actor.stop.remote(grace)] = ("stop", index)
+        lost = self.lost  # nobody is there to answer
+        self.asked = {reference: call for reference, call in self.asked.items() if call[1] not in lost}
+        for index in range(len(self.actors)):
+            if index not in lost:
+                self._ask("stop", index, grace)
 
     def leave(self) -> None:
         """SIGTERM to all that are started, once: one of the machines will go away, or the driver's. Called until all have had it."""
         for index, node in enumerate(self.nodes):
-            if node["started"] and index not in self.left:
-                self.left.add(index)
+            if node["started"] and index not in self.leaving:
+                self.leaving.add(index)
                 self.actors[index].leave.remote()
 
     def listen(self, seconds: float) -> None:
         """Take what actors answer within that time, and what became of those that do not."""
-        if self.asked:
-            ready, _ = ray.wait(list(self.asked), num_returns=1, timeout=seconds)
-            more, _ = ray.wait(list(self.asked), num_returns=len(self.asked), timeout=0)
-            for ref in {*ready, *more}:
-                kind, index = self.asked.pop(ref)
+        if not self.asked:
+            time.sleep(seconds)
+        else:
+            ray.wait(list(self.asked), num_returns=1, timeout=seconds)
+            for reference in ray.wait(list(self.asked), num_returns=len(self.asked), timeout=0)[0]:
+                kind, index = self.asked.pop(reference)
                 try:
-                    self._take(kind, index, ray.get(ref))
+                    self._take(kind, index, ray.get(reference))
                     self.heard[index] = time.monotonic()
                     self.broken.pop(index, None)
                 except ray.exceptions.ActorUnavailableError:  # a connection broke: the machine's end, or the network's
                     self.broken.setdefault(index, time.monotonic())
-                    self.asked[self.actors[index].beat.remote()] = ("beat", index)
+                    self._ask("beat", index)
                     if kind == "wait":
-                        self.asked[self.actors[index].wait.remote()] = ("wait", index)
+                        self._ask("wait", index)
                 except ray.exceptions.RayActorError as error:
                     self.end(index, None, f"its Ray actor died ({_last_line(error)})")
                 except Exception as error:
                     self.end(index, 1, f"node {index}: {_last_line(error)}")
-        else:
-            time.sleep(seconds)
         self._beat()
 
     def _take(self, kind: str, index: int, answer: Any) -> None:
-        node = self.nodes[index]
-        if kind == "facts":
-            node["facts"] = answer
-            wanted = self.plan["nodes"][index]
-            host = wanted["host"]
-            node["gpus"] = answer.get("gpus", "") if wanted["gpus"] else ""
-            if answer["problem"]:
-                self.fail(f"node {index} on {host}: {answer['problem']}")
-            elif answer["version"] != __version__:
-                self.fail(
-                    f"node {index} on {host} has Muster {answer['version']}, the controller {__version__}: install the same on both"
-                )
-        elif kind == "start":
-            if answer:
-                self.end(index, 127, f"node {index}: {answer}")
-            else:
+        node, name = self.nodes[index], f"node {index}"
+        match kind:
+            case "facts":
+                node["facts"], planned = answer, self.plan["nodes"][index]
+                node["gpus"] = answer.get("gpus", "") if planned["gpus"] else ""
+                problem = answer["problem"] and f": {answer['problem']}"
+                if not problem and answer["version"] != __version__:
+                    problem = f" has Muster {answer['version']}, the controller {__version__}: install the same on both"
+                if problem:
+                    self.fail(f"{name} on {planned['host']}{problem}")
+            case "start" if answer:
+                self.end(index, 127, f"{name}: {answer}")
+            case "start":
                 node["started"] = True
-                self.asked[self.actors[index].wait.remote()] = ("wait", index)
-        elif kind == "stop" and answer:  # it was asked in vain: again, until nothing is left
-            self.why, self.deadline = f"node {index}: {answer}", time.monotonic() + _ENDING
-            self.asked[self.actors[index].stop.remote(0.0)] = ("stop", index)
-        elif kind == "wait":
-            self.end(index, answer[0], answer[1] if answer[0] else "")
+                self._ask("wait", index)
+            case "stop" if answer:  # it was asked in vain: again, until nothing is left
+                self.why, self.deadline = f"{name}: {answer}", time.monotonic() + _ENDING
+                self._ask("stop", index, 0.0)
+            case "wait":
+                self.end(index, answer[0], answer[1] if answer[0] else "")
 
     def _beat(self) -> None:
         """Show actors that the driver is there, and see that they are: sooner than Ray, which needs 13 to 64 s."""
@@ -237,41 +213,41 @@ class DrivenGang:
         for index, since in self.broken.items():
             if now - since > _BROKEN:
                 self.end(index, None, "the connection to its Ray actor broke")
-        if now < self.next_beat or not self.actors:
+        if now < self._next_beat or not self.actors:
             return
-        self.next_beat = now + _BEAT
+        self._next_beat = now + _BEAT
         waiting = {index for kind, index in self.asked.values() if kind == "beat"}
-        for index, actor in enumerate(self.actors):
+        patience = _STARTING if self.phase == "starting" else LEASE
+        for index, node in enumerate(self.nodes):
             if index not in waiting:
-                self.asked[actor.beat.remote()] = ("beat", index)
-                if not self.nodes[index]["running"]:
+                self._ask("beat", index)
+                if not node["running"]:
                     self.heard[index] = now
-            elif now - self.heard[index] > (patience := _STARTING if self.phase == "starting" else LEASE):
-                self.nodes[index]["silent"] = True
+            elif now - self.heard[index] > patience:
+                node["silent"] = True
                 self.end(index, None, f"its Ray actor has not answered for {patience:.0f} s")
 
     def forget(self) -> None:
-        """No command was started: who looks for the gang next starts it."""
-        for actor in self.actors:
-            ray.kill(actor)
+        """No command was started: the next driver that finds the gang starts it."""
+        self._kill_actors()
         self.folder.state(self.name).unlink(missing_ok=True)
 
     def clear(self) -> None:
         """The gang is over: its actors go."""
         for index, node in enumerate(self.nodes):
-            if node["started"]:
-                self.end(index, None, "")
-            else:
-                self.end(index, None, "stopped before it was started", Cause.STOPPED)
-        for actor in self.actors:
-            ray.kill(actor)
-        self.actors, self.asked = [], {}
-        self.phase = "stopped"
+            early = ("stopped before it was started", Cause.STOPPED)
+            self.end(index, None, *(("", None) if node["started"] else early))
+        self._kill_actors()
+        self.actors, self.asked, self.phase = [], {}, "stopped"
         self.folder.plan(self.name).unlink(missing_ok=True)
 
+    def _kill_actors(self) -> None:
+        for actor in self.actors:
+            ray.kill(actor)
 
-def _contract(told: Mapping[str, Any]) -> NodeContract:
-    return NodeContract(**{**told, "array": tuple(told["array"]) if told["array"] else None})
+
+def _contract(fields: Mapping[str, Any]) -> NodeContract:
+    return NodeContract(**{**fields, "array": tuple(fields["array"]) if fields["array"] else None})
 
 
 def _last_line(error: Exception) -> str:

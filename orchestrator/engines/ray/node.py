@@ -37,7 +37,7 @@ class Node:
         self._shim: Any = None
         """``shared_store.process.node_processes.NodeProcesses`` of the node."""
         self._problem = ""
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the actor
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - lives as long as the actor
         # The kernel ties a child to the thread that started it: to one that lives as long as the process.
         threading.Thread(target=self._keep, name="keeper", daemon=True).start()
 
@@ -56,12 +56,9 @@ class Node:
             from shared_store import __version__ as muster
         except ImportError as error:
             return {"problem": f"Muster is not installed there for {sys.executable} ({error})"}
-        if directory and not os.path.isdir(directory):
-            return {
-                "problem": f"working directory {directory} is not there: it has to be on a volume that all nodes share"
-            }
-        if not os.path.isdir(store):
-            return {"problem": f"store {store} is not there: it has to be on a volume that all nodes share"}
+        for title, path in ("working directory", directory), ("store", store):
+            if path and not os.path.isdir(path):
+                return {"problem": f"{title} {path} is not there: it has to be on a volume that all nodes share"}
         gpus = os.environ.get("CUDA_VISIBLE_DEVICES", "")
         if muster != version:
             return {"version": muster, "gpus": gpus, "port": 0, "problem": ""}
@@ -94,19 +91,12 @@ class Node:
             named: Variables of this machine that the controller's ``--inherit`` names.
         """
         # Muster is here by now, and of the same version: see facts()
-        from orchestrator.engines.toolkit.environment import inherited, named_variables
-        from shared_store.contract.node import sealed
+        from orchestrator.engines.toolkit.environment import inherited, named_variables, node_environment, supervised
 
         own = inherited(_OF_RAY, ("RAY_",), named=[*named_variables(), *named])
-        environment = {
-            **own,
-            "PATH": f"{os.path.dirname(sys.executable)}:{own.get('PATH', '/usr/bin:/bin')}",
-            "CUDA_VISIBLE_DEVICES": os.environ.get("CUDA_VISIBLE_DEVICES", "") if gpus else "",
-            **sealed(user, contract),
-        }
-        # -P: a folder called "worker" in the job's directory must not hide ours
-        supervisor = [*prefix, sys.executable, "-P", "-m", "worker.supervisor", "--", *command]
-        self._order = (supervisor, environment, directory)
+        visible = os.environ.get("CUDA_VISIBLE_DEVICES", "") if gpus else ""
+        environment = node_environment(own, visible, user, contract)
+        self._order = ([*prefix, *supervised(command)], environment, directory)
         self._ordered.set()
         self._started.wait()
         return self._problem
@@ -116,8 +106,8 @@ class Node:
         self._ended.wait()
         assert self._process is not None
         code = self._process.returncode
-        self._said.seek(0)
-        words = self._said.read().decode(errors="replace").strip().rpartition("\n")[2]
+        self._errors.seek(0)
+        words = self._errors.read().decode(errors="replace").strip().rpartition("\n")[2]
         return code if code >= 0 else 128 - code, words
 
     def beat(self) -> None:
@@ -158,7 +148,7 @@ class Node:
                 cwd=directory,
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=self._said,
+                stderr=self._errors,
                 start_new_session=True,
             )
             shim = find_process(self._process.pid)

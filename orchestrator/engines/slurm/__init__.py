@@ -16,7 +16,7 @@ SBATCH = (
 )
 """Options that sbatch has by the same names."""
 
-TRAITS = Traits(elastic=True, squeue=True)
+TRAITS = Traits(elastic=True, launches=2, squeue=True)
 
 
 def _make(setting: Setting) -> Engine:

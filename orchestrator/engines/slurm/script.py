@@ -64,41 +64,29 @@ class SlurmSubmission:
 
 
 def submission_for(gang: Gang) -> SlurmSubmission:
-    """Raises EngineError as :func:`render` does."""
-    return SlurmSubmission(render(gang), output_path(gang), gang.options.get("partition"))
-
-
-def shown(script: str, credential: str | None) -> str:
-    """The script for people: without the gang's credential on the bus."""
-    return script.replace(json.dumps(credential), json.dumps("…")) if credential else script
-
-
-def output_path(gang: Gang) -> str:
-    """Path of the job's output: the messages of ``srun`` and of the nodes' supervisors."""
-    return str(Store(gang.store).run(gang.run).logs(gang.job, gang.attempt) / "slurm.out")
-
-
-def render(gang: Gang) -> str:
-    """The whole script.
+    """The submission of a gang.
 
     Raises:
-        EngineError: The gang asks for what a Slurm job can't have: nodes of different sizes, volumes, a bad option.
+        EngineError: The gang requests what a Slurm job can't have: nodes of different sizes, volumes, a bad option.
     """
     _check(gang)
-    directives = "\n".join(f"#SBATCH {name}={_quote(value)}" for name, value in _directives(gang).items())
-    shape = f"--cpus-per-task={_cpus(gang)}"
+    output = str(Store(gang.store).run(gang.run).logs(gang.job, gang.attempt) / "slurm.out")
+    directives = "\n".join(f"#SBATCH {name}={_quote(value)}" for name, value in _directives(gang, output).items())
+    shape = f"--cpus-per-task={_whole(gang.placements[0].cpus)}"
     # safe in a here-document: a line of this JSON never is a bare word
     body = _BODY.replace("@python@", shlex.quote(sys.executable)).replace("@shape@", shape)
-    return (
-        f"#!/bin/bash\n{directives}\n#SBATCH --no-requeue\n{body.replace('@nodes@', json.dumps(_told(gang), indent=1))}"
-    )
+    body = body.replace("@nodes@", json.dumps(_input(gang), indent=1))
+    script = f"#!/bin/bash\n{directives}\n#SBATCH --no-requeue\n{body}"
+    return SlurmSubmission(script, output, gang.options.get("partition"))
 
 
 def _check(gang: Gang) -> None:
     shapes = {(_whole(place.cpus), place.memory, len(place.gpus)) for place in gang.placements}
     if len(shapes) > 1:
-        told = "; ".join(f"{cpus} CPUs, {memory} MiB, {gpus} GPUs" for cpus, memory, gpus in sorted(shapes))
-        raise EngineError(f"nodes of one gang are of one size on Slurm, these are not ({told}); give all the largest")
+        sizes = "; ".join(f"{cpus} CPUs, {memory} MiB, {gpus} GPUs" for cpus, memory, gpus in sorted(shapes))
+        raise EngineError(
+            f"Slurm requires identical nodes, these differ ({sizes}); give all of them the largest resources"
+        )
     for container in gang.containers:
         if mounts := mounts_of(container, gang.store):
             raise EngineError(
@@ -110,7 +98,7 @@ def _check(gang: Gang) -> None:
             raise EngineError(f"{name} {value!r} has a control character, which sbatch does not take")
 
 
-def _directives(gang: Gang) -> dict[str, str]:
+def _directives(gang: Gang, output: str) -> dict[str, str]:
     place, options = gang.placements[0], gang.options
     notice = gang.grace + _NOTICE
     found = {
@@ -118,7 +106,7 @@ def _directives(gang: Gang) -> dict[str, str]:
         "--comment": gang.name,
         "--nodes": str(len(gang.placements)),
         "--ntasks-per-node": "1",
-        "--cpus-per-task": str(_cpus(gang)),
+        "--cpus-per-task": str(_whole(place.cpus)),
         "--mem": f"{place.memory}M",
     }
     if place.gpus:
@@ -129,26 +117,21 @@ def _directives(gang: Gang) -> dict[str, str]:
         # sends the notice up to a minute early
         found["--time"] = str(math.ceil((gang.timeout + notice + 60) / 60))
     found |= {f"--{option.name}": value for option in SBATCH if (value := options.get(option.name))}
-    if options.get("nice"):
-        found["--nice"] = str(_nice(options["nice"], gang.priority))
+    if base := options.get("nice"):
+        try:  # users may only lower the priority of a job: the job's own is taken off the base
+            found["--nice"] = str(max(0, int(base) - gang.priority))
+        except ValueError:
+            raise EngineError(f"muster:nice is {base!r}, not a whole number") from None
     return found | {
         "--signal": f"B:USR1@{math.ceil(notice)}",
         "--open-mode": "append",
-        "--output": output_path(gang).replace("%", "%%"),
+        "--output": output.replace("%", "%%"),
         "--chdir": "/tmp",
         "--export": "ALL",
     }
 
 
-def _nice(base: str, priority: int) -> int:
-    """Users may only lower the priority of a job: from ``base``, its own is taken back."""
-    try:
-        return max(0, int(base) - priority)
-    except ValueError:
-        raise EngineError(f"muster:nice is {base!r}, not a whole number") from None
-
-
-def _told(gang: Gang) -> dict[str, Any]:
+def _input(gang: Gang) -> dict[str, Any]:
     """Input of all tasks; nodes that are alike are described once."""
     plans = node_plans(gang, [""] * len(gang.placements), 0)
     kinds: list[Mapping[str, Any]] = []
@@ -165,10 +148,6 @@ def _told(gang: Gang) -> dict[str, Any]:
         of.append(kinds.index(kind))
     contract = dataclasses.asdict(plans[gang.main].contract)
     return {"contract": contract, "directory": gang.directory, "kinds": kinds, "kind": of}
-
-
-def _cpus(gang: Gang) -> int:
-    return _whole(gang.placements[0].cpus)
 
 
 def _whole(cpus: float) -> int:

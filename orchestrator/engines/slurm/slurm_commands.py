@@ -33,7 +33,7 @@ class SlurmUnreachable(NotYet):
 
 @dataclass(frozen=True)
 class SlurmJob:
-    """One job as ``squeue`` tells it."""
+    """One job as ``squeue`` reports it."""
 
     number: str
     state: str
@@ -46,11 +46,11 @@ def call(*command: str, text: str | None = None) -> str:
     """The output of one of Slurm's commands.
 
     Raises:
-        Unreachable: slurmctld does not answer.
+        SlurmUnreachable: slurmctld does not answer.
         EngineError: It refused, in its own words.
     """
-    if (told := os.environ.get("SLURM_CONF")) and not os.path.exists(told):  # Slurm itself would try for a minute
-        raise SlurmUnreachable(f"SLURM_CONF is {told}, which is not there; set it to the cluster's slurm.conf")
+    if (path := os.environ.get("SLURM_CONF")) and not os.path.exists(path):  # Slurm itself would try for a minute
+        raise SlurmUnreachable(f"SLURM_CONF is {path}, which does not exist; set it to the cluster's slurm.conf")
     try:
         done = subprocess.run(
             command, input=text, capture_output=True, text=True, timeout=_LIMIT, env=environment(), errors="replace"
@@ -68,8 +68,8 @@ def call(*command: str, text: str | None = None) -> str:
         ) from None
     if done.returncode == 0:
         return done.stdout
-    said = [re.sub(r"^\w+: (error|fatal): ", "", line).strip() for line in done.stderr.splitlines() if line.strip()]
-    why = "; ".join(dict.fromkeys(said)) or f"exit code {done.returncode}"
+    lines = [re.sub(r"^\w+: (error|fatal): ", "", line).strip() for line in done.stderr.splitlines() if line.strip()]
+    why = "; ".join(dict.fromkeys(lines)) or f"exit code {done.returncode}"
     if _AWAY.search(why):
         raise SlurmUnreachable(f"slurmctld does not answer ({why}); see `scontrol ping`")
     if _UNCONFIGURED.search(why):
@@ -125,8 +125,8 @@ def _words(state: str) -> set[str]:
 
 def address_of_this_machine() -> str | None:
     """Its address towards slurmctld, or, where that runs here, towards the first node; None for loopback. Raises EngineError."""
-    told = dict(re.findall(r"^(\S+)\s+= (.*?)\s*$", call("scontrol", "show", "config"), re.MULTILINE))
-    host, _, address = told.get("SlurmctldHost[0]", "").rstrip(")").partition("(")
+    config = dict(re.findall(r"^(\S+)\s+= (.*?)\s*$", call("scontrol", "show", "config"), re.MULTILINE))
+    host, _, address = config.get("SlurmctldHost[0]", "").rstrip(")").partition("(")
     node = re.search(r"NodeAddr=(\S+)", call("scontrol", "--oneliner", "show", "nodes"))
     for peer in filter(None, (address or host, node and node[1])):
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:

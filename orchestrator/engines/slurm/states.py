@@ -10,20 +10,8 @@ QUEUED = frozenset(
     {"PENDING", "CONFIGURING", "REQUEUED", "REQUEUE_FED", "REQUEUE_HOLD", "SPECIAL_EXIT", "RESV_DEL_HOLD"}
 )
 OVER = frozenset(
-    {
-        "BOOT_FAIL",
-        "CANCELLED",
-        "COMPLETED",
-        "DEADLINE",
-        "FAILED",
-        "LAUNCH_FAILED",
-        "NODE_FAIL",
-        "OUT_OF_MEMORY",
-        "PREEMPTED",
-        "RECONFIG_FAIL",
-        "REVOKED",
-        "TIMEOUT",
-    }
+    {"BOOT_FAIL", "CANCELLED", "COMPLETED", "DEADLINE", "FAILED", "LAUNCH_FAILED", "NODE_FAIL", "OUT_OF_MEMORY"}
+    | {"PREEMPTED", "RECONFIG_FAIL", "REVOKED", "TIMEOUT"}
 )
 """States after which no process of a job is left. COMPLETING is none: its processes are being ended."""
 
@@ -39,8 +27,8 @@ _WAITS = {
     "PartitionInactive": "the partition is inactive; name another one (muster:partition), or wait",
     "PartitionNodeLimit": "it asks for more nodes than the partition has; lower `nodes`, or name another partition",
     "PartitionTimeLimit": "it asks for more time than the partition allows; lower `timeout` (or muster:time)",
-    "PartitionConfig": "the partition can't give what it asks for; name another one (muster:partition)",
-    "BadConstraints": "no node has what it asks for; look at `resources`, muster:constraint and muster:gpu",
+    "PartitionConfig": "the partition can't satisfy the request; name another one (muster:partition)",
+    "BadConstraints": "no node has the requested resources; check `resources`, muster:constraint and muster:gpu",
     "NodeDown": "a node that it needs is down",
     "ReqNodeNotAvail": "nodes that it needs are down, drained or reserved",
     "Nodes required for job are DOWN": "nodes that it needs are down, drained or reserved",

@@ -19,8 +19,7 @@ from orchestrator.engines.api import (
     Traits,
     node_plans,
 )
-from orchestrator.engines.toolkit.endings import ended
-from orchestrator.engines.toolkit.looks import one_by_one
+from orchestrator.engines.toolkit.looks import ended, one_by_one
 
 
 @dataclass

@@ -13,14 +13,15 @@ A limit of a wait only ends a test that hangs.
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 from orchestrator.domain.hosts import engine_of
-from orchestrator.engines.api import Handle, NodePhase, NodeStatus, NotYet, read_handle
+from orchestrator.engines.api import GangStatus, Handle, NodePhase, NodeStatus, NotYet, read_handle
 from orchestrator.engines.testing.rigs import Rig
 from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.waiting import wait_until
 
 LIMIT = 120.0
 """Seconds after which a test fails that waits for an engine."""
@@ -95,21 +96,12 @@ class EngineSuite:
 
     def test_gangs_are_stopped_on_other_threads_while_they_are_looked_at(self, rig: Rig) -> None:
         handles = [launch(rig, f"beside-{number}", 1) for number in range(3)]
-        errors: list[BaseException] = []
-
-        def stop(handle: Handle) -> None:
-            try:
-                rig.engine.stop(handle, 1.0)
-            except BaseException as error:
-                errors.append(error)
-
-        threads = [threading.Thread(target=stop, args=(handle,)) for handle in handles]
-        for thread in threads:
-            thread.start()
-        while any(thread.is_alive() for thread in threads):
-            for handle in handles:
-                assert len(status_of(rig.engine, handle)) == 1
-        assert errors == [], "of a stop"
+        with ThreadPoolExecutor(len(handles)) as pool:
+            stops = [pool.submit(rig.engine.stop, handle, 1.0) for handle in handles]
+            while not all(stop.done() for stop in stops):
+                assert all(len(status_of(rig.engine, handle)) == 1 for handle in handles)
+        for stop in stops:
+            stop.result()
         assert not any(node.running for handle in handles for node in status_of(rig.engine, handle))
 
     def test_an_engine_that_was_never_used_can_be_closed(self, rig: Rig) -> None:
@@ -139,12 +131,14 @@ def launch(rig: Rig, name: str, nodes: int) -> Handle:
 
 
 def await_node(rig: Rig, handle: Handle, index: int, phase: NodePhase) -> NodeStatus:
-    """Look until the node is in that phase."""
-    deadline = time.monotonic() + LIMIT
-    while True:
+    """Wait until the node is in that phase."""
+    status: GangStatus = ()
+
+    def is_there() -> bool:
+        nonlocal status
         status = status_of(rig.engine, handle)
         assert len(status) == handle.nodes, f"{len(status)} nodes of {handle.nodes}"
-        if status[index].phase is phase:
-            return status[index]
-        assert time.monotonic() < deadline, f"node {index} is not {phase} within {LIMIT:g} s: {status}"
-        time.sleep(0.05)
+        return status[index].phase is phase
+
+    assert wait_until(is_there, LIMIT), f"node {index} is not {phase} within {LIMIT:g} s: {status}"
+    return status[index]

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Collection
+import sys
+from collections.abc import Collection, Mapping, Sequence
+
+from shared_store.contract.node import sealed
 
 INHERIT = "MUSTER_INHERIT"
 """Variable that names others to inherit, with spaces between: ``muster serve --inherit NAME``."""
@@ -46,15 +49,36 @@ def inherited(
     """This process's variables that jobs may have.
 
     Args:
-        withheld: Names that are left out, too, unless somebody names them.
-        prefixes: So is what begins with one of these.
+        withheld, prefixes: Names, and beginnings of names, that are left out, too, unless somebody names them.
         kept: Names that stay all the same, private or not.
         named: Others that jobs get; None: :func:`named_variables`.
     """
     added = {*(named_variables() if named is None else named), *kept}
+    left_out = {*PRIVATE, *withheld}
 
     def is_common(name: str) -> bool:
         known = name in COMMON or (name.startswith(FAMILIES) and not _SECRET.search(name))
-        return known and name not in PRIVATE and name not in withheld and not name.startswith(prefixes)
+        return known and name not in left_out and not name.startswith(prefixes)
 
     return {name: value for name, value in os.environ.items() if name in added or is_common(name)}
+
+
+def supervised(command: Sequence[str]) -> list[str]:
+    """The command of a node that runs in this process's Python environment."""
+    # -P: a folder called "worker" in the job's directory must not hide ours
+    return [sys.executable, "-P", "-m", "worker.supervisor", "--", *command]
+
+
+def node_environment(
+    own: Mapping[str, str], gpus: str, job: Mapping[str, str], contract: Mapping[str, str]
+) -> dict[str, str]:
+    """The environment of such a node; what stands later goes over what stands before.
+
+    Args:
+        own: Of this machine: see :func:`inherited`.
+        gpus: ``CUDA_VISIBLE_DEVICES``.
+        job: The job's own.
+        contract: The node contract.
+    """
+    path = f"{os.path.dirname(sys.executable)}:{own.get('PATH', '/usr/bin:/bin')}"
+    return {**own, "PATH": path, "CUDA_VISIBLE_DEVICES": gpus, **sealed(job, contract)}

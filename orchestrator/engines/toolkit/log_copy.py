@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from shared_store.volume.log_files import LogWriter
 
@@ -26,8 +24,8 @@ class LogCopy:
 
     def append(self, lines: Iterable[str]) -> None:
         """Add lines with their ends, from the first that was ever copied on. Raises OSError: they are kept, :meth:`flush` tries again."""
-        given = list(lines)
-        fresh, self._skip = given[self._skip :], max(0, self._skip - len(given))
+        lines = list(lines)
+        fresh, self._skip = lines[self._skip :], max(0, self._skip - len(lines))
         self._pending += "".join(fresh).encode(errors="backslashreplace")
         self.flush()
 
@@ -39,9 +37,3 @@ class LogCopy:
 
     def close(self) -> None:
         self._writer.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None) -> None:
-        self.close()

@@ -1,4 +1,4 @@
-"""Looks at gangs: several in one call of an engine, each with a failure of its own."""
+"""Statuses of gangs: those of several in one call of an engine, each with a failure of its own, and that of a node that has ended."""
 
 from __future__ import annotations
 
@@ -7,19 +7,28 @@ from functools import partial
 from inspect import signature
 from typing import Any
 
-from orchestrator.engines.api import Engine, GangStatus, Handle, Look
+from orchestrator.engines.api import Cause, Engine, GangStatus, Handle, Look, NodePhase, NodeStatus
+
+
+def ended(address: str, exit_code: int | None, words: str = "", gpus: tuple[str, ...] = ()) -> NodeStatus:
+    """A node that has ended: unobserved (None), by a signal (128 + n), or by itself."""
+    cause = Cause.HOST_LOST if exit_code is None else Cause.SIGNAL if exit_code > 128 else Cause.EXIT
+    return NodeStatus(NodePhase.ENDED, address, words, cause, exit_code, gpus)
 
 
 def one_by_one(look: Callable[[Handle], GangStatus], handles: Sequence[Handle]) -> list[Look]:
-    """:meth:`Engine.observe` of an engine that looks at one gang at a time."""
-    return [_tried(look, handle) for handle in handles]
+    """:meth:`Engine.observe` of an engine that observes one gang at a time with ``look``."""
+    statuses: list[Look] = []
+    for handle in handles:
+        try:
+            statuses.append(look(handle))
+        except (Exception, SystemExit) as error:  # the runner tells a failure that may pass from a bug, and reports it
+            statuses.append(error)
+    return statuses
 
 
 def observing_several(engine: Engine) -> Engine:
-    """The engine, with an ``observe`` that takes several handles.
-
-    Engines of others may be older than that: one whose ``observe(handle)`` takes a single handle is asked for one gang at a time.
-    """
+    """The engine, with an ``observe`` that takes several handles: engines of earlier versions have ``observe(handle)``."""
     if "handle" in signature(engine.observe).parameters:
         single: Any = engine.observe
         engine.observe = partial(one_by_one, single)  # type: ignore[method-assign]
@@ -32,10 +41,3 @@ def status_of(engine: Engine, handle: Handle) -> GangStatus:
     if isinstance(look, BaseException):
         raise look
     return look
-
-
-def _tried(look: Callable[[Handle], GangStatus], handle: Handle) -> Look:
-    try:
-        return look(handle)
-    except (Exception, SystemExit) as error:  # the runner tells a failure that may pass from a bug, and reports it
-        return error

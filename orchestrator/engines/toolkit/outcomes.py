@@ -31,8 +31,8 @@ def all_recorded(handle: Handle) -> dict[int, Outcome]:
         names = set(os.listdir(run.outcome(job, attempt, 0).parent))
     except FileNotFoundError:
         return {}
-    there = [index for index in range(handle.nodes) if run.outcome(job, attempt, index).name in names]
-    return {index: outcome for index in there if (outcome := recorded(handle, index)) is not None}
+    present = [index for index in range(handle.nodes) if run.outcome(job, attempt, index).name in names]
+    return {index: outcome for index in present if (outcome := recorded(handle, index)) is not None}
 
 
 def seen(handle: Handle, index: int, code: int, reason: str, at: float, asked: bool = False) -> Outcome:

@@ -98,32 +98,6 @@ def workstation(aws: Serving, tmp_path: Path) -> Iterator[AwsBench]:
     found.close()
 
 
-PRINT = "env | grep -E '^(AWS_|MASTER_|MUSTER_|NODE_RANK|NNODES|RANK|WORLD_SIZE|GREETING)' | sort"
-
-
-def test_a_gang_of_three_has_the_exact_contract_and_its_log_and_outcomes_come_home(bench: AwsBench) -> None:
-    handle = bench.launch(bench.gang(f"{PRINT}; {LAST}", 3, main=1))
-    assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], bench.log()
-    facts = handle.facts
-    lines = [line for line in bench.lines() if line.rank is not None]
-    told = [dict(line.text.split("=", 1) for line in lines if line.node == index) for index in range(3)]
-    main = told[1]["MUSTER_ADDRESS"]
-    for index, env in enumerate(told):
-        assert env["GREETING"] == "hello" and env["MUSTER_ON_CHILD_FAILURE"] == "restart"
-        assert (env["MASTER_ADDR"], env["MASTER_PORT"], env["NNODES"], env["WORLD_SIZE"]) == (main, "29500", "3", "3")
-        assert env["NODE_RANK"] == env["RANK"] == str({1: 0, 0: 1, 2: 2}[index])
-        assert env["AWS_BATCH_JOB_ID"] == f"{facts['aws']}#{index}", "AWS's own"
-        assert (env["AWS_BATCH_JOB_NODE_INDEX"], env["AWS_BATCH_JOB_MAIN_NODE_INDEX"]) == (str(index), "1")
-        assert env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") == (None if index == 1 else main)
-        assert (env["MUSTER_JOB_ID"], env["MUSTER_RUN"], env["MUSTER_EPOCH"]) == (bench.job, "run", "1")
-        assert env["MUSTER_STORE"] == str(bench.volume.path) and env["MUSTER_GANG"] == f"{bench.job}/1/1"
-        assert not {"MUSTER_NODE", "MUSTER_ENVIRONMENT", "MUSTER_BUS", "MUSTER_BUS_TOKEN"} & set(env)
-    assert len({env["MUSTER_ADDRESS"] for env in told}) == 3
-    assert [bench.outcome(index).reason for index in range(3)] == ["done"] * 3
-    volume = bench.volume.run("run")
-    assert read_epoch(volume) == 1 and volume.description() is not None, "the nodes made the run on their volume"
-
-
 def test_one_node_that_fails_tells_why_with_the_error_of_its_rank(bench: AwsBench) -> None:
     script = (
         "import json, os, time\n"
@@ -225,13 +199,6 @@ def test_a_child_that_fails_ends_the_gang_with_its_reason_and_one_that_is_done_d
     bench.ended(bench.launch(bench.gang(failing, 3)))
     assert bench.outcome(0).reason == "node 2: rank 2 exited with code 3"
     assert bench.outcome(2).exit_code == 3 and bench.outcome(1).exit_code == 0
-
-
-def test_a_gang_that_ignores_a_child_s_death_continues(bench: AwsBench) -> None:
-    script = f"[ $NODE_RANK = 1 ] && exit 3; {LAST}; sleep 1; echo done without it"
-    handle = bench.launch(bench.gang(script, 2, environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * 2))
-    assert bench.ended(handle)[0].exit_code == 0
-    assert bench.log() == ["done without it"] and bench.outcome(1).exit_code == 3
 
 
 def test_an_image_without_muster_runs_as_it_is(bench: AwsBench) -> None:

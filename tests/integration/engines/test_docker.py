@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import itertools
 import socket
-import tarfile
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +12,7 @@ from typing import Any
 import pytest
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.engines.api import CannotStart, EngineError, Gang, NotYet
+from orchestrator.engines.api import EngineError, Gang
 from orchestrator.engines.docker import engine as docker_engine
 from orchestrator.engines.docker.engine import DockerEngine
 from orchestrator.engines.toolkit.looks import status_of
@@ -164,14 +161,6 @@ def test_limits_volumes_and_the_rest_of_the_definition_hold(bench: DockerBench) 
     assert bench.log() == ["found", "runs", "store.json", "1234", "321", str(96 * 1024), "read-only"]
 
 
-def test_memory_beyond_the_limit_is_named_as_aws_names_it(bench: DockerBench) -> None:
-    handle = bench.launch(bench.gang("exec python3 -c 'x = bytearray(300 << 20); print(len(x))'", 1, memory=64))
-    [node] = bench.ended(handle)
-    if node.exit_code == 0:
-        pytest.skip("THIS KERNEL DOES NOT LIMIT MEMORY")
-    assert (node.exit_code, node.words) == (137, "OutOfMemoryError: Container killed due to memory usage")
-
-
 def test_a_controller_that_starts_again_finds_the_gang_and_its_log_once(bench: DockerBench) -> None:
     gang = bench.gang("for i in 1 2 3 4 5 6; do echo line $i; sleep 0.3; done", 2)
     handle = bench.launch(gang)
@@ -193,28 +182,6 @@ def test_a_log_that_is_copied_anew_has_its_lines_whole_and_from_when_they_were_p
     bench.ended(handle, bench.new_engine())
     lines = log.read_text()
     assert lines.startswith(early) and bench.log() == ["early", "late"], lines
-
-
-def test_two_threads_that_look_at_once_copy_a_log_once(bench: DockerBench, monkeypatch: pytest.MonkeyPatch) -> None:
-    genuine = docker_engine.read_outcome
-
-    def slow(*arguments: Any) -> Any:
-        time.sleep(0.3)  # a volume far away
-        return genuine(*arguments)
-
-    handle = bench.launch(bench.gang("for i in 1 2 3; do echo line $i; sleep 0.5; done", 1))
-    successor = bench.new_engine()  # as after a restart: the controller's thread and that of a stop look first
-    monkeypatch.setattr(docker_engine, "read_outcome", slow)
-    before = threading.active_count()
-    looks = [threading.Thread(target=successor.observe, args=(handle,)) for _ in range(2)]
-    for look in looks:
-        look.start()
-    for look in looks:
-        look.join()
-    copies = [thread for thread in threading.enumerate() if thread.name.startswith("log muster-")]
-    assert len(copies) <= 2, "one of the first controller, one of its successor"
-    assert threading.active_count() <= before + 1
-    bench.ended(handle)
 
 
 def test_a_long_log_is_copied_with_its_head_and_its_tail(bench: DockerBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -284,25 +251,6 @@ def test_a_killed_or_removed_container_is_a_node_that_ended(bench: DockerBench, 
     assert status_of(bench.engine, handle)[1].exit_code in (137, None)
 
 
-def test_a_missing_image_fails_in_docker_s_words_and_leaves_nothing(bench: DockerBench) -> None:
-    gang = bench.gang(image="muster-test-missing:1")
-
-    def refused() -> str | None:
-        try:
-            bench.engine.launch(bench.engine.plan(gang))
-        except NotYet as wait:
-            assert str(wait) == "pulling image muster-test-missing:1"
-            return None
-        except CannotStart as error:
-            return str(error)
-        raise AssertionError("it was launched")
-
-    words = wait_for(refused, 60, "the pull fails")
-    assert words.startswith("CannotPullContainerError: Error response from daemon: ")
-    assert words.endswith(" (image muster-test-missing:1)")
-    assert bench.left() == (0, 0)
-
-
 def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_starts(bench: DockerBench) -> None:
     train = bench.gang(commands=[["python", "-P", "-m", "worker.train"]] * 2)
     with pytest.raises(EngineError) as refused:
@@ -320,40 +268,6 @@ def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_
     said = f"image {old} has Muster 0.0.1, the controller {__version__}"
     assert str(refused.value) == f"{said}: build it anew with the controller's version"
     assert bench.left() == (0, 0)
-
-
-OWN = ('ENTRYPOINT ["echo", "entrypoint"]', 'CMD ["of", "the image"]')
-SHELL = ("ENTRYPOINT exec sh -c 'echo entrypoint of the shell'",)
-
-
-@pytest.mark.parametrize("labels", [(), (f"LABEL muster.version={__version__}",)], ids=["plain", "supervised"])
-@pytest.mark.parametrize(
-    ("own", "command", "line"),
-    [
-        (OWN, (), "entrypoint of the image"),
-        (OWN, ("of", "the job"), "entrypoint of the job"),
-        (OWN[:1], (), "entrypoint"),
-        (('CMD ["echo", "command alone"]',), (), "command alone"),
-        (SHELL, (), "entrypoint of the shell"),
-    ],
-)
-def test_a_job_without_a_command_runs_that_of_its_image(
-    bench: DockerBench, labels: tuple[str, ...], own: tuple[str, ...], command: tuple[str, ...], line: str
-) -> None:
-    """As Docker runs it by itself; each node of a gang the same."""
-    image = f"muster-test-own-{bench.job}"
-    empty = io.BytesIO()
-    with tarfile.open(fileobj=empty, mode="w"):
-        pass
-    changes = [*own, *labels]
-    bench.client.api.import_image_from_data(empty.getvalue(), repository=image, tag="1", changes=changes)
-    try:
-        handle = bench.launch(bench.gang(nodes=2, image=f"{image}:1", commands=[command] * 2))
-        assert [node.exit_code for node in bench.ended(handle)] == [0, 0], bench.log()
-        assert bench.log() == [line, line]
-        bench.stopped(handle)
-    finally:
-        bench.client.images.remove(f"{image}:1", force=True)
 
 
 def test_an_image_that_has_no_command_either_is_refused(bench: DockerBench) -> None:

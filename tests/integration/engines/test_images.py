@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from shared_store import __version__
 from tests.conftest import Serving
 from tests.support import definitions
 from tests.support.engines.images import PATH, host_files
@@ -21,15 +22,34 @@ def served(docker_client: Any, tmp_path_factory: pytest.TempPathFactory) -> Iter
         yield server
 
 
-@pytest.mark.parametrize("kind", ["container", "multinode"])
+ENTRY = 'ENTRYPOINT ["echo", "entrypoint"]'
+
+
+@pytest.mark.parametrize("labels", [(), (f"LABEL muster.version={__version__}",)], ids=["plain", "supervised"])
+@pytest.mark.parametrize(
+    ("kind", "own", "lines"),
+    [
+        ("container", (ENTRY, 'CMD ["of", "the image"]'), ("entrypoint of the image", "entrypoint of the job")),
+        ("multinode", (ENTRY, 'CMD ["of", "the image"]'), ("entrypoint of the image", "entrypoint of the job")),
+        ("multinode", (ENTRY,), ("entrypoint", "entrypoint of the job")),
+        ("container", ('CMD ["echo", "command alone"]',), ("command alone",)),
+        ("container", ("ENTRYPOINT exec sh -c 'echo entrypoint of the shell'",), ("entrypoint of the shell",)),
+    ],
+)
 def test_a_definition_without_a_command_runs_that_of_its_image_unless_the_submission_has_one(
-    served: Serving, docker_client: Any, kind: str
+    served: Serving,
+    docker_client: Any,
+    kind: str,
+    own: tuple[str, ...],
+    lines: tuple[str, ...],
+    labels: tuple[str, ...],
 ) -> None:
+    """As Docker runs it by itself."""
     empty = io.BytesIO()
     with tarfile.open(fileobj=empty, mode="w"):
         pass
-    own = ['ENTRYPOINT ["echo", "entrypoint"]', 'CMD ["of", "the image"]']
-    docker_client.api.import_image_from_data(empty.getvalue(), repository="muster-test-own", tag="1", changes=own)
+    changes = [*own, *labels]
+    docker_client.api.import_image_from_data(empty.getvalue(), repository="muster-test-own", tag="1", changes=changes)
     properties = {**definitions.container(env={"PATH": PATH}), "image": "muster-test-own:1", **host_files()}
     del properties["command"]
     make = definitions.single if kind == "container" else definitions.multinode
@@ -37,7 +57,7 @@ def test_a_definition_without_a_command_runs_that_of_its_image_unless_the_submis
     change: dict[str, Any] = {"containerOverrides": {"command": ["of", "the job"]}}
     if kind == "multinode":
         change = {"nodeOverrides": {"nodePropertyOverrides": [{"targetNodes": "0:", **change}]}}
-    for more, line in (({}, "entrypoint of the image"), (change, "entrypoint of the job")):
+    for more, line in zip(({}, change), lines, strict=False):
         job = served.client.batch("SubmitJob", jobName="own", jobQueue="default", jobDefinition=arn, **more)["jobId"]
         assert served.wait(job)["status"] == "SUCCEEDED", served.detail(job)
         assert line in served.log(job)

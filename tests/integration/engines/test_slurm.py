@@ -12,12 +12,11 @@ from typing import Any
 import pytest
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.engines.api import Cause, EngineError, Handle, NodeStatus, NotYet
-from orchestrator.engines.slurm import script as slurm_script
+from orchestrator.engines.api import EngineError, Handle, NodeStatus, NotYet
 from orchestrator.engines.slurm import slurm_commands
 from orchestrator.engines.slurm.engine import SlurmEngine
 from orchestrator.engines.slurm.slurm_commands import SlurmJob, list_hosts
-from orchestrator.engines.slurm.states import ending, waiting
+from orchestrator.engines.slurm.states import waiting
 from orchestrator.engines.toolkit.looks import status_of
 from tests.conftest import Serving, wait_for
 from tests.support.engines.sites import STUBBORN, WAIT
@@ -137,15 +136,6 @@ def test_a_node_sees_its_gpus_alone_and_each_job_has_a_port(bench: SlurmBench, m
     assert all(line.startswith("gpus[] port ") for line in lines) and lines[0] != lines[1], lines
 
 
-def test_a_single_node_job_and_an_array_s_child_have_no_node_variables(bench: SlurmBench) -> None:
-    child = {"is_gang": False, "array": (4, 9), "environments": [{}]}
-    handle = bench.launch(bench.gang("env | grep ^AWS_BATCH | sort; exit 3", **child))
-    [node] = bench.ended(handle)
-    assert node.exit_code == 3
-    names = [line.partition("=")[0] for line in bench.log() if line.startswith("AWS_BATCH")]
-    assert "AWS_BATCH_JOB_ARRAY_INDEX=4" in bench.log() and not [name for name in names if "NODE" in name]
-
-
 def test_a_controller_that_was_killed_after_sbatch_finds_the_job_that_it_submitted(bench: SlurmBench) -> None:
     gang = bench.gang(nodes=2)
     handle = bench.launch(gang)
@@ -218,7 +208,7 @@ MOUNTED["mountPoints"] = [{"sourceVolume": "v", "containerPath": "/mnt"}]
         ({"cpus": 5}, "Slurm refuses the job: .*Requested node configuration is not available"),
         ({"options": {"nice": "much"}}, "muster:nice is 'much', not a whole number"),
         ({"title": "a\nb"}, "title .* has a control character"),
-        (UNEQUAL, "nodes of one gang are of one size on Slurm, these are not .*64 MiB.*128 MiB"),
+        (UNEQUAL, "Slurm requires identical nodes, these differ .*64 MiB.*128 MiB"),
         ({"containers": [MOUNTED]}, "volume /mnt: the slurm engine mounts nothing"),
     ],
 )
@@ -288,11 +278,10 @@ def test_a_first_node_without_python_or_store_is_one_line(bench: SlurmBench, mon
         handle = bench.launch(bench.gang(nodes=2))
     for node in bench.ended(handle):
         assert not node.running and node.words.endswith("/no/python: No such file or directory"), node
-    render = slurm_script.render
-    elsewhere = "/nowhere/slurm.out"
-    moved = lambda gang: render(gang).replace(slurm_script.output_path(gang), elsewhere)  # noqa: E731
-    monkeypatch.setattr(slurm_script, "render", moved)
-    [node] = bench.ended(bench.launch(bench.gang(suffix="2")))
+    plan = bench.engine.plan(bench.gang(suffix="2"))
+    elsewhere = plan.request.script.replace(plan.request.output, "/nowhere/slurm.out")
+    request = dataclasses.replace(plan.request, script=elsewhere)
+    [node] = bench.ended(bench.engine.launch(dataclasses.replace(plan, request=request)))
     assert node.words.startswith("Slurm could not start it on n1: is ")
     assert "file system that all nodes share" in node.words
 
@@ -317,18 +306,3 @@ DOWN = "Slurm: nodes that it needs are down, drained or reserved"
 )
 def test_slurm_s_reason_for_a_waiting_job_is_put_into_words(state: str, reason: str, words: str) -> None:
     assert waiting(SlurmJob("5", state, reason, "n1", "")).startswith(words)
-
-
-@pytest.mark.parametrize(
-    ("state", "cause", "code", "words"),
-    [
-        ("PREEMPTED", Cause.PREEMPTED, 75, "preempted by Slurm, and did not leave in time"),
-        ("TIMEOUT", Cause.STOPPED, 137, "Slurm ended it at its time limit; ask for more (timeout, or muster:time)"),
-        ("OUT_OF_MEMORY", Cause.OUT_OF_MEMORY, 137, "OutOfMemoryError: Container killed due to memory usage"),
-        ("NODE_FAIL", Cause.HOST_LOST, 137, "Slurm lost a node of n1"),
-        ("COMPLETED", Cause.EXIT, 0, "Slurm says COMPLETED"),
-        ("SOMETHING_NEW", None, 137, "Slurm says SOMETHING_NEW, Why"),
-    ],
-)
-def test_a_node_without_outcome_ends_as_slurm_says(state: str, cause: Cause | None, code: int, words: str) -> None:
-    assert ending(SlurmJob("5", state, "Why", "n1", ""), "/store/slurm.out") == (cause, code, f"{words} (job 5)")

@@ -39,8 +39,7 @@ from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.toolkit.looks import status_of
-from orchestrator.engines.toolkit.stopping import stop_within
-from orchestrator.engines.transience import is_final
+from orchestrator.engines.toolkit.waiting import stop_within
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate
 from shared_store.volume.layout import Store
@@ -93,11 +92,26 @@ def observed(several: EngineSet, handle: str) -> GangStatus | None:
     ],
 )
 def test_transient_errors_are_retried_and_others_are_final(number: str, final: bool) -> None:
-    assert is_final(OSError(getattr(errno, number), number)) is final
+    error = OSError(getattr(errno, number), number)
+    with pytest.raises(EngineError) as raised:
+        refused_plan(error)
+    assert isinstance(raised.value, Transient) is not final
 
 
 def test_an_error_without_a_number_is_not_final() -> None:
-    assert not is_final(OSError("a library's own"))
+    with pytest.raises(Transient, match="a library's own"):
+        refused_plan(OSError("a library's own"))
+
+
+def refused_plan(error: OSError) -> None:
+    """Plan a gang on an engine that raises this error."""
+    engine = FakeEngine()
+    asked = runner.Runner(engine, lambda _: None)
+    engine.plan = lambda gang: (_ for _ in ()).throw(error)  # type: ignore[method-assign]
+    try:
+        asked.plan(make_gang(Path("/")))
+    finally:
+        asked.close()
 
 
 def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(

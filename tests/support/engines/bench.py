@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import uuid
 from abc import ABC, abstractmethod
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus, NotYet
+from orchestrator.engines.testing import rigs
 from orchestrator.engines.toolkit.looks import status_of
 from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.layout import Store
@@ -23,23 +25,11 @@ from tests.support.waiting import wait_for
 def make_gang(store: Path, script: str = WAIT, nodes: int = 2, **changes: Any) -> Gang:
     """A gang whose nodes run ``sh -c script``, with ``changes``."""
     attempt = changes.get("attempt", 1)
-    facts: dict[str, Any] = {
-        "job": "job",
-        "attempt": attempt,
-        "epoch": attempt,
-        "job_epoch": 1,
-        "run": "run",
-        "store": str(store),
-        "queue": "default",
-        "compute_environment": "here",
-        "main": 0,
-        "commands": [["sh", "-c", script]] * nodes,
-        "environments": [{"GREETING": "hello"}] * nodes,
-        "placements": [Placement("localhost", (), 0.5, 64)] * nodes,
-        "grace": 5.0,
-        "directory": None,
-    }
-    return Gang(**{**facts, **changes})
+    gang = rigs.make_gang("job", str(store), nodes, "localhost", ["sh", "-c", script])
+    facts: dict[str, Any] = {"attempt": attempt, "epoch": attempt, "run": "run", "compute_environment": "here"}
+    facts |= {"environments": [{"GREETING": "hello"}] * nodes, "grace": 5.0, "is_native": False}
+    facts["placements"] = [Placement("localhost", (), 0.5, 64)] * nodes
+    return replace(gang, **{**facts, **changes})
 
 
 class Bench(ABC):

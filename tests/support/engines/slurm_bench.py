@@ -21,7 +21,7 @@ from tests.support.waiting import wait_for
 
 class SlurmBench(Bench):
     engine: SlurmEngine
-    asks_again = ("being handed to slurmctld", "has not answered")
+    asks_again = ("has not answered",)
 
     def __init__(self, cluster: SlurmCluster, home: Path) -> None:
         self.cluster = cluster

@@ -7,7 +7,7 @@ import pytest
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import EngineError, NodePlan
 from orchestrator.engines.docker.engine import _addresses
-from orchestrator.engines.docker.options import limits, linux
+from orchestrator.engines.docker.request import limits, linux
 from tests.support.worker.node import node_contract
 
 

@@ -29,7 +29,9 @@ DOCUMENTATION = Path(__file__).parents[4] / "docs"
 def test_muster_s_own_engines_are_entry_points_and_any_other_is_refused_with_those_that_are() -> None:
     assert ENGINES[:5] == ("local", "docker", "ray", "slurm", "aws-batch")
     assert all(isinstance(engine_type(name), EngineType) for name in ENGINES)
-    with pytest.raises(EngineError, match="there is no engine 'kubernetes'; there are local, docker, ray, slurm, aws-"):
+    with pytest.raises(
+        EngineError, match="there is no engine 'kubernetes'; available: local, docker, ray, slurm, aws-"
+    ):
         engine_type("kubernetes")
 
 
@@ -38,7 +40,7 @@ def test_muster_s_own_engines_are_entry_points_and_any_other_is_refused_with_tho
     [
         ("nowhere_at_all:ENGINE", "engine odd: nowhere_at_all:ENGINE can't be imported: No module named"),
         ("orchestrator.engines.local:NONE", "engine odd: .* can't be imported: .*NONE"),
-        ("orchestrator.engines.api:Option", "engine odd: orchestrator.engines.api:Option is no EngineType"),
+        ("orchestrator.engines.api:Option", "engine odd: orchestrator.engines.api:Option is not an EngineType"),
     ],
 )
 def test_an_entry_point_that_leads_to_no_engine_is_named(value: str, why: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,7 +13,7 @@ from orchestrator.engines.ray.engine import _status as ray_status
 from orchestrator.engines.slurm.engine import _node as slurm_node
 from orchestrator.engines.slurm.engine import _queued as slurm_queued
 from orchestrator.engines.slurm.slurm_commands import SlurmJob
-from orchestrator.engines.toolkit.endings import ended
+from orchestrator.engines.toolkit.looks import ended
 from shared_store.contract.faults import Fault
 from shared_store.volume.node_outcomes import OUT_OF_MEMORY, FirstError, Outcome
 
@@ -143,18 +143,10 @@ def test_aws_s_exit_code_and_reason_give_the_cause_of_a_node_s_end(
     code: int | None, reason: str, cause: Cause | None
 ) -> None:
     pytest.importorskip("boto3")
-    from orchestrator.engines.aws_batch.node_status import node_ended
+    from orchestrator.engines.aws_batch.watched_gang import node_ended
 
     check_end(node_ended("10.0.0.1", code, reason), cause, code, reason)
     check_end(node_ended("10.0.0.1", None, reason, not_started=True), Cause.CANNOT_START, None, reason)
-
-
-@pytest.mark.parametrize(("status", "phase"), [("RUNNABLE", QUEUED), ("SUBMITTED", QUEUED), ("STARTING", STARTING)])
-def test_a_node_that_aws_has_not_started_is_queued_until_it_has_an_instance(status: str, phase: NodePhase) -> None:
-    pytest.importorskip("boto3")
-    from orchestrator.engines.aws_batch.node_status import waits
-
-    assert waits(status, "", "AWS Batch gets 2 instances") == NodeStatus(phase, words="AWS Batch gets 2 instances")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,8 @@
-"""The thread of an engine: what its caller never waits for, and what is kept of a launch that can't be made yet."""
+"""The runner of an engine: what its caller never waits for, what is kept of a launch, and the engine's health."""
 
 from __future__ import annotations
 
+import time
 import traceback
 from collections.abc import Iterator
 
@@ -114,3 +115,40 @@ def test_launches_that_hang_are_named_and_hold_up_no_look(
     engine.answers.set()
     wait_for(lambda: not words(), 10, "that all are launched")
     assert asked.health.problem is None
+
+
+def test_a_launch_whose_handle_could_not_be_recorded_is_not_asked_for_again(engine: FakeEngine, asked: Runner) -> None:
+    def launch() -> Handle | None:
+        try:
+            return asked.launch(GANG.name, lambda: engine.plan(GANG))
+        except NotYet:
+            return None
+
+    handle = wait_for(launch, 10, "the launch")
+    del engine.cluster.gangs[GANG.name]  # an engine that has forgotten it would start it anew
+    assert launch() == handle and len(engine.cluster.launched) == 1
+    assert asked.launch_pause(GANG.name) == 0
+    asked.forget(GANG.name, handle)
+    assert wait_for(launch, 10, "another launch") == handle and len(engine.cluster.launched) == 2
+
+
+def test_an_engine_s_health_says_when_it_answered_last_why_it_fails_and_that_it_hangs(
+    engine: FakeEngine, asked: Runner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked.capacity(patience=10)
+    told = asked.health.told_at
+    assert told is not None and time.time() * 1000 - 60_000 < told <= time.time() * 1000
+    assert (asked.health.problem, asked.health.failing, asked.health.retry) == (None, 0, None)
+    engine.error = Transient("the daemon refuses the connection")
+    asked.capacity(patience=10)
+    assert asked.health.problem == "the daemon refuses the connection" and asked.health.told_at == told
+    engine.error = None
+    asked.capacity(patience=10)
+    assert asked.health.problem is None
+    monkeypatch.setattr(runner, "OVERDUE", 0.1)
+    engine.answers.clear()
+    asked.capacity()
+    said = str(wait_for(lambda: asked.health.problem, 10, "the silence"))
+    assert "the fake engine has not answered since" in said
+    engine.answers.set()
+    wait_for(lambda: asked.health.problem is None, 10, "the recovery")

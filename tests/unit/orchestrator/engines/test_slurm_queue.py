@@ -136,17 +136,6 @@ def test_between_two_calls_of_squeue_starts_and_ends_are_seen_by_what_the_job_le
     assert seen(engine, cluster, "2").phase is NodePhase.QUEUED and cluster.asked == asked
 
 
-def test_a_gang_that_was_just_submitted_is_looked_for_at_once(cluster: Cluster) -> None:
-    engine = slurm.SlurmEngine(240.0)
-    cluster.states = {"1": "RUNNING"}
-    seen(engine, cluster, "1")
-    cluster.machine.time += 2.0
-    cluster.states["2"] = "PENDING"
-    engine._submitted["2"] = cluster.machine.time  # as a submission notes it
-    cluster.machine.time += 2.0
-    assert seen(engine, cluster, "2").phase is NodePhase.QUEUED
-
-
 def test_a_job_that_others_cancelled_says_so_and_one_that_muster_cancelled_does_not(cluster: Cluster) -> None:
     cluster.states = {"1": "RUNNING", "2": "PENDING"}
     for number in cluster.states:
@@ -162,27 +151,6 @@ def test_a_job_that_others_cancelled_says_so_and_one_that_muster_cancelled_does_
     assert (by_others.cause, by_others.exit_code) == (Cause.CANCELLED, 75)
     assert by_others.words == "cancelled in Slurm (scancel), not by Muster (job 1)"
     assert (by_muster.cause, by_muster.exit_code) == (Cause.EXIT, 75)
-
-
-def test_numbers_of_cancelled_jobs_are_forgotten_with_their_jobs(cluster: Cluster) -> None:
-    engine = slurm.SlurmEngine()
-    for number in range(20):
-        cluster.states = {str(number): "PENDING"}
-        cluster.machine.time += 10.0
-        engine.stop(cluster.handle(str(number)), 0.0)
-    assert len(engine._cancelled) <= 2
-
-
-def test_what_was_cancelled_before_a_view_has_it_is_remembered(cluster: Cluster) -> None:
-    cluster.states = {"1": "RUNNING"}
-    cluster.begin("1")
-    engine = slurm.SlurmEngine()
-    seen(engine, cluster, "1")
-    for number in ("2", "3"):
-        cluster.machine.time += 0.01
-        cluster.states[number] = "PENDING"
-        engine._cancel(number)
-    assert list(engine._cancelled) == ["2", "3"]
 
 
 def test_the_settings_are_checked(cluster: Cluster) -> None:
