@@ -7,7 +7,6 @@ file's digest, the track's measures and its origin. It appears by a rename that 
 from __future__ import annotations
 
 import re
-import shutil
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -120,19 +119,15 @@ def add(store: Store, name: str, data: bytes, facts: Mapping[str, Any]) -> Store
     track = StoredTrack(folder_in(store) / name)
     if name in names(store):
         raise _taken(track)
-    folder_in(store).mkdir(parents=True, exist_ok=True)
-    hidden = folder_in(store) / f".{uuid.uuid4().hex}.tmp"
     try:
-        hidden.mkdir()
-        (hidden / FILE).write_bytes(data)
-        bundles.seal(hidden, {"track": {**facts, "name": name, "created": time.time()}})
-        for file in hidden.iterdir():
-            file.chmod(0o444)
-        bundles.publish(hidden, track.path)
+        with bundles.hidden_folder(folder_in(store) / f".{uuid.uuid4().hex}.tmp") as hidden:
+            (hidden / FILE).write_bytes(data)
+            bundles.seal(hidden, {"track": {**facts, "name": name, "created": time.time()}})
+            for file in hidden.iterdir():
+                file.chmod(0o444)
+            bundles.publish(hidden, track.path)
     except FileExistsError:  # another was faster
         raise _taken(track) from None
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
     return track
 
 

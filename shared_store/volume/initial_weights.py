@@ -9,7 +9,6 @@ A run that imitates a teacher holds a copy of the teacher's weights in the same 
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import threading
@@ -20,7 +19,15 @@ from pathlib import Path
 from typing import Any, Self
 
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, checkpoint_called
-from shared_store.volume.files import DamagedFile, open_regular, sync_directory, write_json
+from shared_store.volume.files import (
+    MANIFEST,
+    DamagedFile,
+    copy_file,
+    difference_of,
+    rename_new,
+    sync_directory,
+    write_json,
+)
 from shared_store.volume.layout import Run, Store
 
 WEIGHTS = "learner.pt"
@@ -71,29 +78,23 @@ class WeightsCopy:
             OSError: The volume is full or gone.
         """
         with self._using:
-            self._copy(place)
-
-    def _copy(self, place: str) -> None:
-        manifest = self.source.manifest
-        if WEIGHTS not in manifest["files"]:
-            raise DamagedCheckpoint(f"checkpoint {self.source.name}: it has no {WEIGHTS}, and so no weights")
-        self._in_progress.add(self.hidden)
-        self._clear_leftovers()
-        target = self.hidden / place / self.source.name
-        target.mkdir(parents=True)
-        try:
-            with open_regular(self.source.path / WEIGHTS) as there, open(target / WEIGHTS, "wb") as here:
-                shutil.copyfileobj(there, here, 1 << 20)
-                here.flush()
-                os.fsync(here.fileno())
-        except DamagedFile:
-            raise DamagedCheckpoint(f"checkpoint {self.source.name}: {WEIGHTS} is not a regular file") from None
-        except (FileNotFoundError, NotADirectoryError):
-            raise DamagedCheckpoint(f"checkpoint {self.source.name}: {WEIGHTS} is missing") from None
-        write_json(target / "manifest.json", {**manifest, "files": {WEIGHTS: manifest["files"][WEIGHTS]}})
-        Checkpoint(target, self.source.iteration, self.source.epoch).verify()
-        for each in (target, target.parent, self.hidden):
-            sync_directory(each)
+            manifest = self.source.manifest
+            if WEIGHTS not in manifest["files"]:
+                raise DamagedCheckpoint(f"checkpoint {self.source.name}: it has no {WEIGHTS}, and so no weights")
+            self._in_progress.add(self.hidden)
+            self._clear_leftovers()
+            target = self.hidden / place / self.source.name
+            target.mkdir(parents=True)
+            entry = manifest["files"][WEIGHTS]
+            try:
+                copy_file(self.source.path / WEIGHTS, target / WEIGHTS)
+            except (DamagedFile, FileNotFoundError, NotADirectoryError):
+                why = difference_of(self.source.path, WEIGHTS, entry)
+                raise DamagedCheckpoint(f"checkpoint {self.source.name}: {why}") from None
+            write_json(target / MANIFEST, {**manifest, "files": {WEIGHTS: entry}})
+            Checkpoint(target, self.source.iteration, self.source.epoch).verify()
+            for each in (target, target.parent, self.hidden):
+                sync_directory(each)
 
     def discard(self) -> None:
         """Delete the unfinished copy."""
@@ -143,11 +144,9 @@ class NewRun(WeightsCopy):
             if os.path.lexists(run.path):
                 raise RunExists
             try:
-                os.rename(self.hidden, run.path)
-            except OSError as error:
-                if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
-                    raise RunExists from None  # another controller was faster
-                raise
+                rename_new(self.hidden, run.path)
+            except FileExistsError:
+                raise RunExists from None  # another controller was faster
             self._published = run.path
             sync_directory(run.path.parent)
         return run

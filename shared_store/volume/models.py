@@ -24,8 +24,8 @@ from shared_store.volume import bundles
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.evaluations import list_evaluations
-from shared_store.volume.files import read_json, refuse_links, write_json
-from shared_store.volume.layout import NAME, Run, Store
+from shared_store.volume.files import hidden_folder, read_json, refuse_links, write_json
+from shared_store.volume.layout import NAME, Run, Store, names_in
 
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
@@ -90,11 +90,7 @@ def check_name(name: str) -> None:
 
 def model_names(store: Store) -> list[str]:
     """Names of all models that have a version."""
-    try:
-        names = sorted(entry.name for entry in os.scandir(store.models) if NAME.fullmatch(entry.name))
-    except FileNotFoundError:
-        return []
-    return [name for name in names if versions(store, name)]
+    return [name for name in names_in(store.models) if versions(store, name)]
 
 
 def versions(store: Store, name: str) -> list[Model]:
@@ -109,11 +105,9 @@ def versions(store: Store, name: str) -> list[Model]:
     return [Model(folder / str(n), name, n) for n in sorted(int(each) for each in entries if _VERSION.fullmatch(each))]
 
 
-def _all(_: Model) -> bool:
-    return True
-
-
-def find(store: Store, name: str, version: int | None = None, visible: Callable[[Model], bool] = _all) -> Model:
+def find(
+    store: Store, name: str, version: int | None = None, visible: Callable[[Model], bool] = lambda model: True
+) -> Model:
     """A version of a model, by default the newest. Raises UnknownModel with the nearest name, or the existing versions.
 
     ``visible``: whether the caller may see the model with this newest version; others are as if they did not exist.
@@ -125,11 +119,10 @@ def find(store: Store, name: str, version: int | None = None, visible: Callable[
         raise UnknownModel(f"model {name} does not exist; {hint}")
     if version is None:
         return found[-1]
-    for model in found:
-        if model.version == version:
-            return model
-    there = ", ".join(str(model.version) for model in found)
-    raise UnknownModel(f"model {name} has no version {version}; there are: {there}")
+    if model := next((model for model in found if model.version == version), None):
+        return model
+    existing = ", ".join(str(model.version) for model in found)
+    raise UnknownModel(f"model {name} has no version {version}; there are: {existing}")
 
 
 _in_progress: set[Path] = set()
@@ -180,35 +173,35 @@ def register(
     _in_progress.add(hidden)
     try:
         _clear_leftovers(store, registrar)
-        hidden.mkdir()
-        bundles.copy_files(bundle, hidden / "bundle")
-        lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))
-        while True:
-            there = versions(store, name)
-            if not again and (same := _version_of(there, lineage)) is not None:
-                raise AlreadyRegistered(
-                    f"the same checkpoint is {same.reference} already; --again registers it once more"
-                )
-            version = there[-1].version + 1 if there else 1
-            model = Model(folder / str(version), name, version)
-            write_json(hidden / "model.json", {**facts, **lineage, "name": name, "version": version})
-            (hidden / bundles.MANIFEST).unlink(missing_ok=True)
-            bundles.seal(hidden, {"model": model.reference, "created": time.time()})
-            for path in hidden.rglob("*"):
-                if path.is_file():
-                    path.chmod(0o444)
-            # if another registration was faster, this one is the next version: a rename never replaces a non-empty directory
-            with contextlib.suppress(FileExistsError):
-                bundles.publish(hidden, model.path)
-                return model
+        with hidden_folder(hidden):
+            (hidden / "bundle").mkdir()
+            bundles.copy_files(bundle, hidden / "bundle")
+            lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))
+            while True:
+                existing = versions(store, name)
+                if not again and (same := _version_of(existing, lineage)) is not None:
+                    raise AlreadyRegistered(
+                        f"the same checkpoint is {same.reference} already; --again registers it once more"
+                    )
+                version = existing[-1].version + 1 if existing else 1
+                model = Model(folder / str(version), name, version)
+                write_json(hidden / "model.json", {**facts, **lineage, "name": name, "version": version})
+                (hidden / bundles.MANIFEST).unlink(missing_ok=True)
+                bundles.seal(hidden, {"model": model.reference, "created": time.time()})
+                for path in hidden.rglob("*"):
+                    if path.is_file():
+                        path.chmod(0o444)
+                # if another registration was faster, this one is the next version: a rename never replaces a non-empty directory
+                with contextlib.suppress(FileExistsError):
+                    bundles.publish(hidden, model.path)
+                    return model
     finally:
-        shutil.rmtree(hidden, ignore_errors=True)
         _in_progress.discard(hidden)
 
 
-def _version_of(there: Sequence[Model], lineage: Mapping[str, Any]) -> Model | None:
+def _version_of(existing: Sequence[Model], lineage: Mapping[str, Any]) -> Model | None:
     """The newest version of the same checkpoint, compared by its files, since an earlier run may have had the same name."""
-    for model in reversed(there):
+    for model in reversed(existing):
         with contextlib.suppress(DamagedBundle):
             facts = model.facts()
             if all(facts.get(key) == lineage[key] for key in ("run", "checkpoint", "checkpoint_files")):
