@@ -14,7 +14,6 @@ import re
 import socket
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 from shared_store.volume.files import open_regular, refuse_links, sync_directory, write_atomic
 from shared_store.volume.layout import Run, StoreError
@@ -90,7 +89,7 @@ def raise_epoch(run: Run, epoch: int, claim: Claim | None = None) -> None:
 def read_claim(run: Run, epoch: int) -> Claim | None:
     """The open attempt that has ``epoch``; None if it is closed, unknown or damaged. Raises OSError."""
     try:
-        with open_regular(_claim_path(run, epoch)) as file:
+        with open_regular(run.path / f"EPOCH.{epoch}") as file:
             value = json.loads(file.read(_LONGEST_CLAIM))
         return Claim(str(value["controller"]), str(value["job"]), int(value["attempt"]))
     except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
@@ -103,7 +102,7 @@ def close_claim(run: Run, epoch: int) -> None:
     Raises OSError; DamagedFile if the run is a link, or the file is not a regular one.
     """
     refuse_links(run.path, 1)
-    with contextlib.suppress(FileNotFoundError), open_regular(_claim_path(run, epoch), write=True) as file:
+    with contextlib.suppress(FileNotFoundError), open_regular(run.path / f"EPOCH.{epoch}", write=True) as file:
         file.truncate()
         os.fsync(file.fileno())
 
@@ -152,7 +151,7 @@ def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
     refuse_links(run.path, 1)
     run.path.mkdir(parents=True, exist_ok=True)
     try:
-        descriptor = os.open(_claim_path(run, epoch), os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        descriptor = os.open(run.path / f"EPOCH.{epoch}", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     except FileExistsError:
         return False
     with open(descriptor, "wb") as file:
@@ -183,10 +182,6 @@ def _publish(run: Run, epoch: int) -> None:
         claim = re.fullmatch(r"EPOCH\.([0-9]{1,15})", name)
         if claim and int(claim[1]) < epoch - _KEPT:
             (run.path / name).unlink(missing_ok=True)
-
-
-def _claim_path(run: Run, epoch: int) -> Path:
-    return run.path / f"EPOCH.{epoch}"
 
 
 def _stale(run: Run, epoch: int, current: int) -> StaleEpoch:
