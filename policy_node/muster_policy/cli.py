@@ -213,7 +213,7 @@ def _ros_name(option: str, text: str) -> str:
 def _domain(given: int | None) -> int:
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
     if given is None and not text.isdigit():
-        raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
+        raise Refused(f"ROS_DOMAIN_ID={text}: expected an integer")
     domain = int(text) if given is None else given
     if not 0 <= domain <= 232:
         raise Refused(f"domain {domain}: expected 0 to 232")
@@ -234,7 +234,7 @@ def _whole(text: str) -> int:
     try:
         return int(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a whole number, found {text}") from None
+        raise argparse.ArgumentTypeError(f"expected an integer, found {text}") from None
 
 
 def _say(line: str) -> None:

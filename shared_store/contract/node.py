@@ -177,7 +177,7 @@ _VARIABLES = {each.metadata["variable"]: each for each in fields(NodeContract) i
 _WHERE_ABSENT = {"AWS_BATCH_JOB_ATTEMPT": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
 """Values of variables that a node outside of a gang need not have."""
 _FORMS = {
-    "int": (re.compile(r"-?[0-9]+"), int, "a whole number"),
+    "int": (re.compile(r"-?[0-9]+"), int, "an integer"),
     "float": (re.compile(r"[0-9]+(\.[0-9]*)?(e[+-]?[0-9]+)?"), float, "a number"),
 }
 
@@ -187,7 +187,7 @@ def _read(env: Mapping[str, str], variable: str, kind: Any, default: Any) -> Any
     value = env.get(variable)
     if default is not MISSING and (value is None or (not value and kind == "float | None")):
         return default
-    form, convert, words = _FORMS.get(kind.partition(" ")[0], (None, str, "a text"))
+    form, convert, words = _FORMS.get(kind.partition(" ")[0], (None, str, "a string"))
     if form.fullmatch(value or "") if form else value or default is not MISSING:
         return convert(value)
     problem = f"is {value!r}, not {words}" if value or kind == "float" else "is missing"

@@ -52,7 +52,7 @@ def read_epoch(run: Run) -> int:
     except FileNotFoundError:
         return 0
     if not re.fullmatch(r"[0-9]{1,15}", text):
-        raise ValueError(f"{path}: expected a whole number of at most 15 digits, found {text!r}")
+        raise ValueError(f"{path}: expected an integer of at most 15 digits, found {text!r}")
     return int(text)
 
 

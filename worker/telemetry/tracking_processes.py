@@ -40,7 +40,7 @@ class Tracking:
         if not is_main or not wanted:
             return
         if not isinstance(wanted, dict) or not all(isinstance(each, dict | None) for each in wanted.values()):
-            raise UserError("track: expected a mapping of services, such as {wandb: {project: ant}}")
+            raise UserError("track: expected an object of services, such as {wandb: {project: ant}}")
         from worker.telemetry.services import SERVICES
 
         for name, settings in wanted.items():

@@ -145,7 +145,7 @@ def _nice(base: str, priority: int) -> int:
     try:
         return max(0, int(base) - priority)
     except ValueError:
-        raise EngineError(f"muster:nice is {base!r}, not a whole number") from None
+        raise EngineError(f"muster:nice is {base!r}, not an integer") from None
 
 
 def _told(gang: Gang) -> dict[str, Any]:

@@ -213,7 +213,7 @@ BY_ENGINE = "a node is started by one of Muster's engines"
     [
         ({"MUSTER_JOB_ID": None}, f"MUSTER_JOB_ID is missing; {BY_ENGINE}"),
         ({"MUSTER_STORE": None}, f"MUSTER_STORE is missing; {BY_ENGINE}"),
-        ({"MUSTER_EPOCH": "x"}, f"MUSTER_EPOCH is 'x', not a whole number; {BY_ENGINE}"),
+        ({"MUSTER_EPOCH": "x"}, f"MUSTER_EPOCH is 'x', not an integer; {BY_ENGINE}"),
         ({"MUSTER_GRACE_SECONDS": "x"}, f"MUSTER_GRACE_SECONDS is 'x', not a number; {BY_ENGINE}"),
         ({"MUSTER_RUN": "../x"}, "run name '../x': use letters, digits, '.', '_' and '-' only, at most 128 of them"),
         ({"MUSTER_STORE": "/dev/null"}, "store: Not a directory: /dev/null/runs/run/EPOCH"),
@@ -235,7 +235,7 @@ def test_a_damaged_epoch_file_is_reported_in_one_line(node: Nodes) -> None:
     n = node()
     (n.run.path / "EPOCH").write_text("")
     assert n.call("true") == 2
-    said = f"muster supervisor: {n.run.path}/EPOCH: expected a whole number of at most 15 digits, found ''\n"
+    said = f"muster supervisor: {n.run.path}/EPOCH: expected an integer of at most 15 digits, found ''\n"
     assert n.stderr.read_text() == said
 
 

@@ -112,7 +112,7 @@ WHOLE = ("AWS_BATCH_JOB_ATTEMPT", "AWS_BATCH_JOB_NODE_INDEX", "MASTER_PORT", "MU
 MALFORMED = [
     *((name, {name: ""}, MISSING) for name in ("MUSTER_JOB_ID", "MUSTER_RUN", "MUSTER_STORE", "MUSTER_EPOCH")),
     *(
-        (name, {name: v}, f"{v!r}, not a whole number; ")
+        (name, {name: v}, f"{v!r}, not an integer; ")
         for name in WHOLE
         for v in ("two", "1.5", "--5", "²", "1_000", " 1")
     ),

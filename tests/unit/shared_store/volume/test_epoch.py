@@ -62,7 +62,7 @@ def test_a_damaged_epoch_is_named_with_its_value(run: Run, content: str) -> None
     with pytest.raises(ValueError) as refused:
         read_epoch(run)
     found = repr(content[:32])
-    assert str(refused.value) == f"{run.path}/EPOCH: expected a whole number of at most 15 digits, found {found}"
+    assert str(refused.value) == f"{run.path}/EPOCH: expected an integer of at most 15 digits, found {found}"
 
 
 def test_no_epoch_follows_the_largest(run: Run) -> None:
