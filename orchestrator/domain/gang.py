@@ -190,7 +190,7 @@ def gang_needs(node_properties: Mapping[str, Any]) -> GangSpec:
         minimum = int(variables.get("MUSTER_MIN_NODES", count))
     except ValueError:
         raise ValueError(
-            f"MUSTER_MIN_NODES is {variables['MUSTER_MIN_NODES'][:20]!r}; expected an integer of nodes"
+            f"MUSTER_MIN_NODES is {variables['MUSTER_MIN_NODES'][:20]!r}; expected an integer number of nodes"
         ) from None
     least = min(max(minimum, main + 1), count)  # never without the main node
     return GangSpec(main, whole, least, NativeOptions.read(variables))

@@ -77,7 +77,7 @@ def test_a_form_that_is_sent_again_leads_to_the_job_that_it_made(console: Consol
         ("train.config.rewards.alive", "[1]", "found"),
         ("train.ppo.gamma", "7", "7"),
         ("name", "a b", "expected letters"),
-        ("nodes", "x", "expected an integer of nodes"),
+        ("nodes", "x", "expected an integer number of nodes"),
         ("timeout", "soon", "expected a duration"),
     ],
 )

@@ -111,8 +111,14 @@ BODIES: dict[str, tuple[dict[str, Any] | str, str]] = {
         {"spec": {**TRAIN, "train": {**TRAIN["train"], "config": {"deeper": ["\ud800"]}}}},
         "spec: train.config.deeper.0: half of a character",
     ),
-    "a zero byte in a command": ({"spec": {**SPEC, "command": ["a\0"]}}, "spec: command.0: expected a string without a"),
-    "a zero byte in an image": ({"spec": {**SPEC, "image": "a\0"}}, "spec: image: expected a string without a zero byte"),
+    "a zero byte in a command": (
+        {"spec": {**SPEC, "command": ["a\0"]}},
+        "spec: command.0: expected a string without a",
+    ),
+    "a zero byte in an image": (
+        {"spec": {**SPEC, "image": "a\0"}},
+        "spec: image: expected a string without a zero byte",
+    ),
     "a variable of Muster": (
         {"spec": {**SPEC, "environment": {"MUSTER_SPEC": "{}"}}},
         "environment: MUSTER_SPEC is res",

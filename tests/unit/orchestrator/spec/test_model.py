@@ -51,7 +51,7 @@ RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a lette
 TASKS = ", ".join(known_tasks())
 TOP = ", ".join(Spec.model_fields)
 
-NODES = "expected an integer of nodes, or {min: 2, max: 4}"
+NODES = "expected an integer number of nodes, or {min: 2, max: 4}"
 ONE_OF = f"expected exactly one of {', '.join(KINDS)}; found"
 MAPPING = "expected an object of keys such as name, nodes, train; found"
 LINES = {
