@@ -15,7 +15,7 @@ import re
 import shutil
 import stat
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
@@ -203,14 +203,25 @@ def remove_tree(path: Path) -> None:
     shutil.rmtree(hidden, ignore_errors=True)
 
 
+_in_progress: set[Path] = set()
+
+
 @contextmanager
-def hidden_folder(path: Path) -> Iterator[Path]:
-    """A new directory ``path``, with a hidden name, for content that :func:`publish` shows at once; deleted unless that has renamed it."""
+def hidden_folder(path: Path, leftovers: Iterable[Path] = ()) -> Iterator[Path]:
+    """A new directory ``path``, with a hidden name, for content that :func:`publish` shows at once; deleted unless that has renamed it.
+
+    ``leftovers``: directories of the same owner; those that no other context of this process has are of killed processes, and are deleted.
+    """
+    _in_progress.add(path)
     try:
+        for each in leftovers:
+            if each not in _in_progress and not each.parent.is_symlink():
+                shutil.rmtree(each, ignore_errors=True)
         path.mkdir(parents=True)
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)
+        _in_progress.discard(path)
 
 
 def publish(hidden: Path, target: Path) -> None:
@@ -250,14 +261,9 @@ def read_manifest(
     damaged: Callable[[str], Exception],
     newer: Callable[[str], Exception],
 ) -> dict[str, Any]:
-    """The manifest of an immutable directory.
+    """The manifest of an immutable directory, whose files have these ``names``: none leads out of it.
 
-    Args:
-        folder: The directory.
-        names: Valid names of its files: none leads out of it.
-        newest: The newest format to read.
-        damaged: Makes the error to raise from its words.
-        newer: The same for a manifest of a newer format.
+    Raises what ``damaged`` makes of the error's words; for a format after the ``newest``, what ``newer`` does.
     """
     try:
         manifest = read_json(folder / MANIFEST)

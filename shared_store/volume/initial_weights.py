@@ -14,7 +14,7 @@ import shutil
 import threading
 import uuid
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,6 +24,7 @@ from shared_store.volume.files import (
     DamagedFile,
     copy_file,
     difference_of,
+    hidden_folder,
     rename_new,
     sync_directory,
     write_json,
@@ -51,8 +52,6 @@ class WeightsCopy:
         source: Checkpoint with the weights.
     """
 
-    _in_progress: set[Path] = set()
-
     def __init__(self, store: Store, owner: str, source: Checkpoint) -> None:
         self._store, self._owner, self.source = store, owner, source
         self.job = str(uuid.uuid4())
@@ -60,6 +59,7 @@ class WeightsCopy:
         self.hidden = store.path / "runs" / f".{owner}.{self.job.replace('-', '')[:12]}.clone"
         self._published: Path | None = None
         self._using = threading.RLock()
+        self._folder = ExitStack()
 
     def __enter__(self) -> Self:
         return self
@@ -81,8 +81,8 @@ class WeightsCopy:
             manifest = self.source.manifest
             if WEIGHTS not in manifest["files"]:
                 raise DamagedCheckpoint(f"checkpoint {self.source.name}: it has no {WEIGHTS}, and so no weights")
-            self._in_progress.add(self.hidden)
-            self._clear_leftovers()
+            leftovers = (self._store.path / "runs").glob(f".{self._owner}.*.clone")
+            self._folder.enter_context(hidden_folder(self.hidden, leftovers))
             target = self.hidden / place / self.source.name
             target.mkdir(parents=True)
             entry = manifest["files"][WEIGHTS]
@@ -108,14 +108,7 @@ class WeightsCopy:
     def close(self) -> None:
         """End the copy: no part of it has a hidden name any more."""
         with self._using:
-            shutil.rmtree(self.hidden, ignore_errors=True)
-            self._in_progress.discard(self.hidden)
-
-    def _clear_leftovers(self) -> None:
-        with suppress(OSError):
-            for path in (self._store.path / "runs").glob(f".{self._owner}.*.clone"):
-                if path not in self._in_progress:
-                    shutil.rmtree(path, ignore_errors=True)
+            self._folder.close()
 
 
 class NewRun(WeightsCopy):

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
@@ -98,10 +97,7 @@ def versions(store: Store, name: str) -> list[Model]:
     check_name(name)
     folder = store.models / name
     refuse_links(folder, 2)
-    try:
-        entries = os.listdir(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        return []
+    entries = os.listdir(folder) if folder.is_dir() else ()
     return [Model(folder / str(n), name, n) for n in sorted(int(each) for each in entries if _VERSION.fullmatch(each))]
 
 
@@ -123,10 +119,6 @@ def find(
         return model
     existing = ", ".join(str(model.version) for model in found)
     raise UnknownModel(f"model {name} has no version {version}; there are: {existing}")
-
-
-_in_progress: set[Path] = set()
-"""Hidden directories of this process's current registrations."""
 
 
 def register(
@@ -168,35 +160,29 @@ def register(
         )
     folder = store.models / name
     refuse_links(folder, 2)
-    folder.mkdir(parents=True, exist_ok=True)
     hidden = folder / f".{registrar}.{uuid.uuid4().hex}.tmp"
-    _in_progress.add(hidden)
-    try:
-        _clear_leftovers(store, registrar)
-        with hidden_folder(hidden):
-            (hidden / "bundle").mkdir()
-            bundles.copy_files(bundle, hidden / "bundle")
-            lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))
-            while True:
-                existing = versions(store, name)
-                if not again and (same := _version_of(existing, lineage)) is not None:
-                    raise AlreadyRegistered(
-                        f"the same checkpoint is {same.reference} already; --again registers it once more"
-                    )
-                version = existing[-1].version + 1 if existing else 1
-                model = Model(folder / str(version), name, version)
-                write_json(hidden / "model.json", {**facts, **lineage, "name": name, "version": version})
-                (hidden / bundles.MANIFEST).unlink(missing_ok=True)
-                bundles.seal(hidden, {"model": model.reference, "created": time.time()})
-                for path in hidden.rglob("*"):
-                    if path.is_file():
-                        path.chmod(0o444)
-                # if another registration was faster, this one is the next version: a rename never replaces a non-empty directory
-                with contextlib.suppress(FileExistsError):
-                    bundles.publish(hidden, model.path)
-                    return model
-    finally:
-        _in_progress.discard(hidden)
+    with hidden_folder(hidden, store.models.glob(f"*/.{registrar}.*.tmp") if registrar else ()):
+        (hidden / "bundle").mkdir()
+        bundles.copy_files(bundle, hidden / "bundle")
+        lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))
+        while True:
+            existing = versions(store, name)
+            if not again and (same := _version_of(existing, lineage)) is not None:
+                raise AlreadyRegistered(
+                    f"the same checkpoint is {same.reference} already; --again registers it once more"
+                )
+            version = existing[-1].version + 1 if existing else 1
+            model = Model(folder / str(version), name, version)
+            write_json(hidden / "model.json", {**facts, **lineage, "name": name, "version": version})
+            (hidden / bundles.MANIFEST).unlink(missing_ok=True)
+            bundles.seal(hidden, {"model": model.reference, "created": time.time()})
+            for path in hidden.rglob("*"):
+                if path.is_file():
+                    path.chmod(0o444)
+            # if another registration was faster, this one is the next version: a rename never replaces a non-empty directory
+            with contextlib.suppress(FileExistsError):
+                bundles.publish(hidden, model.path)
+                return model
 
 
 def _version_of(existing: Sequence[Model], lineage: Mapping[str, Any]) -> Model | None:
@@ -207,13 +193,6 @@ def _version_of(existing: Sequence[Model], lineage: Mapping[str, Any]) -> Model 
             if all(facts.get(key) == lineage[key] for key in ("run", "checkpoint", "checkpoint_files")):
                 return model
     return None
-
-
-def _clear_leftovers(store: Store, registrar: str) -> None:
-    """Delete the leftovers of this controller's killed registrations, for any model; those of other controllers may still be running."""
-    for path in store.models.glob(f"*/.{registrar}.*.tmp") if registrar else ():
-        if path not in _in_progress and not path.parent.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
 
 
 def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> dict[str, Any]:
