@@ -93,7 +93,8 @@ def _group_differences(before: Group, now: Group, ranges: bool, left_out: Sequen
         lines = _named(_columns(before, ranges, left_out), _columns(now, ranges, left_out), f"observation{of}")
     if before.image and now.image:
         old, new = (dataclasses.asdict(each) for each in (before.image, now.image))
-        old, new = ({**each, **each.pop("camera")} for each in (old, new))  # its settings stand beside the others
+        for each in (old, new):
+            each.update(each.pop("camera"))  # its settings stand beside the others
         lines += [f"image{of}: {line}" for line in _changed(old, new)]
     if not lines and (before.shape, before.dtype) != (now.shape, now.dtype):
         lines.append(

@@ -13,8 +13,8 @@ import pytest
 
 from orchestrator.spec.json_schema import contract_schema
 from shared_store.contract.documents import DocumentError
-from shared_store.contract.policy import Action, Command, Contract, Frame, Group, Image, State, Term, read
-from shared_store.contract.policy_changes import brief, differences
+from shared_store.contract.policy import Action, Command, Contract, Group, Image, State, Term, read
+from shared_store.contract.policy_changes import differences
 from tests.conftest import REPOSITORY
 
 ANGLES = Term(
@@ -57,14 +57,6 @@ def document(change: Callable[[dict[str, Any]], Any] = lambda document: None) ->
     found: dict[str, Any] = json.loads(json.dumps(CONTRACT.document()))
     change(found)
     return found
-
-
-def terms_of(found: dict[str, Any]) -> Any:
-    return found["groups"][0]["terms"]
-
-
-def after(change: Callable[[dict[str, Any]], Any]) -> list[str]:
-    return differences(CONTRACT, read(document(change)))
 
 
 def test_a_contract_that_was_written_reads_the_same_and_fits_its_published_schema() -> None:
@@ -112,46 +104,6 @@ def test_a_malformed_contract_is_refused_in_one_line(said: str) -> None:
     assert str(caught.value) == f"contract.json: {said}"
 
 
-def test_each_change_of_meaning_is_a_line() -> None:
-    assert after(lambda found: terms_of(found)[0].update(scale=[0.5, 1.0])) == [
-        "observation 0: joint_pos/left_knee (1 steps ago) scale 1.0 became 0.5",
-        "observation 2: joint_pos/left_knee scale 1.0 became 0.5",
-    ]
-    assert after(lambda found: terms_of(found)[1].update(units=["km/h"])) == [
-        "observation 4: speed unit m/s became km/h"
-    ]
-    assert after(lambda found: terms_of(found)[0]["sensors"].update(imu="ImuSensor, site head"))[0] == (
-        "observation 0: joint_pos/left_knee (1 steps ago) sensor imu ImuSensor, site imu became ImuSensor, site head"
-    )
-    assert after(lambda found: found["actions"][0].update(stiffness=40.0, effort_limit=None)) == [
-        "action 0: left_knee stiffness 20.0 became 40.0",
-        "action 0: left_knee effort_limit 30.0 became none",
-    ]
-    assert after(lambda found: found.update(control_hz=60.0)) == ["the control rate 50 Hz became 60 Hz"]
-    assert after(lambda found: found["groups"].pop()) == ["the observation group front is gone"]
-    assert after(lambda found: found["groups"][1]["image"]["camera"].update(fov=1.1)) == [
-        "image of front: fov 0.9 became 1.1"
-    ]
-    assert after(lambda found: found["states"][0].update(shape=[1, 32])) == [
-        "the recurrent state h [1, 64] became h [1, 32]"
-    ]
-    assert after(lambda found: found["commands"].clear()) == ["the command velocity is gone"]
-
-
-def test_the_frame_of_a_quantity_is_compared_if_both_contracts_have_it() -> None:
-    def placed(*position: float) -> Contract:
-        frame = Frame("imu", "trunk", position, (0.0, 0.0, 0.0, 1.0), True)
-        group = dataclasses.replace(CONTRACT.groups[0], terms=(ANGLES, dataclasses.replace(SPEED, frame=frame)))
-        return dataclasses.replace(CONTRACT, groups=(group, CONTRACT.groups[1]))
-
-    first, second = placed(0.0, 0.0, 0.0), placed(0.0, 0.0, 0.1)
-    assert differences(first, first) == [] == differences(CONTRACT, first) == differences(first, CONTRACT)
-    (line,) = differences(first, second)
-    assert (
-        line.startswith("observation 4: speed frame [trunk, 0.0, 0.0, 0.0") and "became [trunk, 0.0, 0.0, 0.1" in line
-    )
-
-
 def test_a_contract_of_format_1_is_read_with_fewer_entries() -> None:
     def older(found: dict[str, Any]) -> None:
         found["format"] = 1
@@ -167,22 +119,12 @@ def test_a_contract_of_format_1_is_read_with_fewer_entries() -> None:
     assert differences(there, CONTRACT) == [] == differences(CONTRACT, there)
 
 
-def test_added_removed_and_moved_names_are_reported_by_name() -> None:
-    swapped = dataclasses.replace(CONTRACT, actions=CONTRACT.actions[::-1], action_names=("right_knee", "left_knee"))
-    assert differences(CONTRACT, swapped) == [
-        "action 0: left_knee became action 1",
-        "action 1: right_knee became action 0",
-    ]
-    renamed = after(lambda found: found["groups"][0]["terms"][1].update(names=["pace"]))
-    assert renamed == ["observation 4: speed is gone", "observation 4: speed/pace is new"]
-
-
 def test_values_that_follow_from_a_robot_s_file_can_be_left_out_and_meanings_can_not() -> None:
     def changed(found: dict[str, Any]) -> None:
         found["actions"][0].update(
             stiffness=30.0, damping=1.0, scale=0.5, offset=0.4, default_position=0.4, effort_limit=20.0
         )
-        terms_of(found)[0].update(offset=[0.4, -0.4])
+        found["groups"][0]["terms"][0].update(offset=[0.4, -0.4])
 
     there = read(document(changed))
     assert len(differences(CONTRACT, there)) == 10 and differences(CONTRACT, there, of_robot=False) == []
@@ -191,14 +133,3 @@ def test_values_that_follow_from_a_robot_s_file_can_be_left_out_and_meanings_can
         "action 0: left_knee kind position became effort",
         "action 0: left_knee unit rad became N m",
     ]
-
-
-def test_numbers_that_a_compiler_rounded_are_no_change_and_many_differences_are_shortened() -> None:
-    assert after(lambda found: found["actions"][0].update(stiffness=20.0000005)) == []
-    wider: Callable[[dict[str, Any]], Any] = lambda found: found["commands"][0].update(ranges=[[-2.0, 2.0]])  # noqa: E731
-    assert after(wider) == []
-    assert differences(CONTRACT, read(document(wider)), ranges=True) == [
-        "command velocity: ranges [[-1.0, 1.0]] became [[-2.0, 2.0]]"
-    ]
-    assert brief(["a", "b"]) == "a; b"
-    assert brief([str(index) for index in range(8)]) == "0; 1; 2; 3; 4; and 3 more"

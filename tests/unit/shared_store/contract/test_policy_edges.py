@@ -1,4 +1,4 @@
-"""Edges of the policy contract, beside test_policy_contract.py: what is compared, and what counts as equal."""
+"""Edges of the policy contract, beside test_policy.py: what is compared, and what counts as equal."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from shared_store.contract.documents import DocumentError
 from shared_store.contract.policy import (
     LARGEST,
     Action,
@@ -20,7 +19,6 @@ from shared_store.contract.policy import (
     State,
     Target,
     Term,
-    read,
 )
 from shared_store.contract.policy_changes import brief, differences
 
@@ -54,6 +52,7 @@ def with_choice(**changes: Any) -> Contract:
 
 A, B = "observation of critic 0: wheels/a", "observation of critic 1: wheels/b"
 DIFFERENCES: dict[str, tuple[Contract, Contract, list[str]]] = {
+    "a rate": (CONTRACT, replace(CONTRACT, control_hz=60.0), ["the control rate 20 Hz became 60 Hz"]),
     "a kind": (CONTRACT, with_term(kind="previous_action"), [f"{each} kind measured became previous_action" for each in (A, B)]),
     "a clip": (CONTRACT, with_term(clip=(-1.0, 1)), [f"{each} clip none became [-1.0, 1]" for each in (A, B)]),
     "a quantity": (CONTRACT, with_term(quantity="q"), [f"{each} quantity none became q" for each in (A, B)]),
@@ -96,7 +95,7 @@ DIFFERENCES: dict[str, tuple[Contract, Contract, list[str]]] = {
 
 
 @pytest.mark.parametrize("case", DIFFERENCES)
-def test_what_is_told_of_two_contracts(case: str) -> None:
+def test_each_difference_is_a_line(case: str) -> None:
     before, now, lines = DIFFERENCES[case]
     assert differences(before, now) == lines
 
@@ -124,36 +123,6 @@ def test_what_only_training_is_about_is_compared_on_request() -> None:
     assert differences(CONTRACT, with_command(seconds=(1.0, 3.0)), ranges=True) == [
         "command go: seconds [1.0, 2.0] became [1.0, 3.0]"
     ]
-
-
-@pytest.mark.parametrize(
-    ("contract", "said"),
-    [
-        (with_term(history=0), "groups.critic.wheels: begins at 0, and the terms before it end at 0"),
-        *((with_term(**{name: ("m",)}), "have different lengths") for name in ("units",)),
-        *((with_term(**{name: (1.0,)}), "have different lengths") for name in ("scale", "offset")),
-        (with_term(ranges=(None,)), "have different lengths"),
-        (with_group(CONTRACT, shape=(2, 1)), "its terms have 2 numbers, its shape is [2, 1]"),
-        (with_choice(name="x"), "action_names are not the names of actions, in order"),
-        (replace(CONTRACT, format=5), "has format 5, this Muster reads up to 4; upgrade Muster"),
-    ],
-)
-def test_a_contract_that_contradicts_itself_is_refused(contract: Contract, said: str) -> None:
-    with pytest.raises(DocumentError, match=r"^there: ") as caught:
-        read(contract.document(), "there")
-    assert said in str(caught.value)
-
-
-def test_a_contract_is_read_as_it_was_written_and_its_infinities_are_the_largest_numbers() -> None:
-    assert read(CONTRACT.document()) == CONTRACT and read(with_choice().document()) == with_choice()
-    two = with_group(with_term(ranges=(None, (0.0, 1.0)), history=2), shape=(4,))
-    assert read(two.document()) == two and two.groups[0].terms[0].size == 4
-    found = with_choice(clip=(-math.inf, math.inf), scale=2.5).document()
-    assert found["actions"][0]["clip"] == [-LARGEST, LARGEST] and found["actions"][0]["scale"] == 2.5
-    with pytest.raises(DocumentError):
-        read([])
-    with pytest.raises(DocumentError):
-        read({"format": "4"})
 
 
 def test_a_group_is_found_by_its_name_and_up_to_five_differences_are_all_shown() -> None:

@@ -17,6 +17,7 @@ from shared_store.volume.checkpoints import (
     Checkpoint,
     CheckpointWriter,
     DamagedCheckpoint,
+    best_checkpoint,
     list_checkpoints,
     newest_checkpoint,
     retain,
@@ -248,13 +249,14 @@ def nest(path: Path) -> None:
 
 ENTRY, UNREADABLE = "manifest.json has no size and digest of rank-0.pt", "manifest.json can't be read"
 ONE = {"size": 1, "sha256": "0"}
+STATE = {"size": 5, "sha256": hashlib.sha256(b"state").hexdigest()}
 DAMAGES = {
     "a bit flipped": (flip_a_bit, "the content of rank-1.pt was altered (SHA-256 differs)"),
     "a file cut short": (cut("rank-1.pt", 10), "rank-1.pt has 10 bytes, 1600 were written"),
     "a file emptied": (cut("learner.pt", 0), "learner.pt has 0 bytes, 1700 were written"),
     "a file deleted": (delete("rank-0.pt"), "rank-0.pt is missing"),
     "a file that is a pipe": (replace_by_pipe, "rank-0.pt is not a regular file"),
-    "no manifest": (delete("manifest.json"), "manifest.json is missing or empty"),
+    "no manifest": (delete("manifest.json"), "manifest.json is missing"),
     "an empty manifest": (cut("manifest.json", 0), UNREADABLE),
     "half a manifest": (cut("manifest.json", 40), UNREADABLE),
     "a manifest nested deep": (nest, UNREADABLE),
@@ -264,10 +266,17 @@ DAMAGES = {
         "manifest.json names '../../etc/passwd', which is no file of it",
     ),
     "a zero byte in a name": (edit(files={"a\0b": ONE}), r"manifest.json names 'a\x00b', which is no file of it"),
+    "a negative size": (edit(files={"rank-0.pt": {**ONE, "size": -1}}), ENTRY),
+    "a size that is a truth value": (edit(files={"rank-0.pt": {**ONE, "size": True}}), ENTRY),
+    "a size that no volume has": (edit(files={"rank-0.pt": {**ONE, "size": 2**63}}), ENTRY),
+    "a digest that is a number": (edit(files={"rank-0.pt": {**ONE, "sha256": 7}}), ENTRY),
+    "a hidden name": (edit(files={".rank": ONE}), "manifest.json names '.rank', which is no file of it"),
+    "no format": (edit(format="1"), "manifest.json has no format"),
+    "worlds that are an object": (edit(worlds={}), "manifest.json: worlds is not a number"),
     "a size that is a text": (edit(files={"rank-0.pt": {"size": "x", "sha256": "0"}}), ENTRY),
     "half an entry": (edit(files={"rank-0.pt": {"size": 1600}}), ENTRY),
     "an entry that is none": (edit(files={"rank-0.pt": None}), ENTRY),
-    "a manifest without files": (edit(files=None), "manifest.json is missing or empty"),
+    "a manifest without files": (edit(files=None), "manifest.json lists no files"),
     "a reward that is a list": (edit(reward=[1]), "manifest.json: reward is not a number"),
     "a newer format": (
         edit(format=FORMAT + 1),
@@ -374,3 +383,83 @@ def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: R
     (run.checkpoints / "00000010-e1" / "manifest.json").write_text("{")
     commit(run, 40, keep=2)
     assert names(run) == ["00000030-e1", "00000040-e1"]
+
+
+def test_the_best_has_the_greatest_score_that_is_a_number_and_of_equals_it_is_the_later(run: Run) -> None:
+    assert best_checkpoint(run) is None
+    commit(run, 1, reward=9.0)
+    assert best_checkpoint(run) is None
+    for iteration, score in ((2, -5.0), (3, 1), (4, 1.0), (5, 0.5), (6, None)):
+        commit(run, iteration, score=score)
+    assert best_checkpoint(run).iteration == 4
+    for name, text in (("2", '{"files": {}, "format": 1, "score": Infinity}'), ("4", "{")):
+        (run.checkpoints / f"0000000{name}-e1" / "manifest.json").write_text(text)
+    assert best_checkpoint(run).iteration == 3
+
+
+def test_checkpoints_that_were_saved_only_for_long_iterations_and_those_with_exports_are_kept_apart(run: Run) -> None:
+    for iteration, scheduled in ((1, True), (2, True), (3, True), (4, False), (5, False)):
+        commit(run, iteration, scheduled=scheduled)
+    assert [each.is_scheduled for each in list_checkpoints(run)] == [True, True, True, False, False]
+    (run.exports / "00000001-e1").mkdir(parents=True)
+    assert retain(run, 1) == ["00000002-e1", "00000004-e1"] and [each.iteration for each in list_checkpoints(run)] == [
+        1,
+        3,
+        5,
+    ]
+    (run.checkpoints / "00000005-e1" / "manifest.json").write_text("{")
+    assert list_checkpoints(run)[-1].is_scheduled
+
+
+def test_a_commit_takes_its_writers_digests_and_publishes_no_notes(run: Run) -> None:
+    writer = CheckpointWriter(run, 3, 2)
+    (writer.path / "rank-0.pt").write_bytes(b"state")
+    (writer.path / ".note").touch()
+    (writer.path / "manifest.json").write_text("of an earlier try")
+    there = CheckpointWriter(run, 3, 2)
+    made = there.commit({}, digests={"rank-0.pt": STATE})
+    made.verify()
+    assert sorted(os.listdir(made.path)) == ["manifest.json", "rank-0.pt"] and made.manifest["created"] > 1e9
+    assert (made.path.name, made.iteration, made.epoch) == ("00000003-e2", 3, 2)
+    again = CheckpointWriter(run, 4, 2)
+    (again.path / "manifest.json").write_text("of an earlier try")
+    assert again.commit({}).manifest["files"] == {}
+    with pytest.raises(FileNotFoundError):
+        CheckpointWriter(Run(run.path / "gone"), 1, 1)
+
+
+def test_a_commit_sweeps_what_is_older_than_itself(run: Run) -> None:
+    for iteration, epoch in ((9, 1), (4, 2), (5, 2), (6, 2), (1, 3)):
+        CheckpointWriter(run, iteration, epoch)
+    (run.checkpoints / ".LATEST.1.tmp").touch()
+    assert sorted(sweep(run, up_to=(2, 5))) == [
+        ".00000004-e2.tmp",
+        ".00000005-e2.tmp",
+        ".00000009-e1.tmp",
+        ".LATEST.1.tmp",
+    ]
+    commit(run, 7, epoch=2)
+    assert sorted(os.listdir(run.checkpoints)) == [".00000001-e3.tmp", "00000007-e2", "LATEST"]
+
+
+def test_what_is_set_aside_is_durable(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    checkpoint = commit(run, 5)
+    seen = durable_operations(monkeypatch)
+    moved = set_aside(checkpoint)
+    assert seen == [("rename", str(moved)), ("fsync", str(run.checkpoints))]
+
+
+def test_an_attempt_that_lost_its_run_in_the_rename_prunes_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    commit(run, 1)
+    raise_epoch(run, 1)
+    rename = os.rename
+
+    def frozen(old: Path, new: Path) -> None:
+        rename(old, new)
+        raise_epoch(run, 2)
+
+    monkeypatch.setattr(os, "rename", frozen)
+    commit(run, 2, keep=1)
+    assert [each.iteration for each in list_checkpoints(run)] == [1, 2] and (
+        run.checkpoints / "LATEST"
+    ).read_text() == "00000001-e1\n"

@@ -183,18 +183,6 @@ def test_clones_pupils_models_and_entries_need_their_runs(store: Store) -> None:
     )
 
 
-def test_what_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> None:
-    add_run(store, "source")
-    (store.run("source").parent).mkdir()
-    (store.run("source").path / "run.json").write_text("{")
-    write(store.models / "ant" / "1" / "model.json", "{")
-    (store.models / "bee" / "1").mkdir(parents=True)
-    found, unreadable = references(store)
-    assert found == []
-    for part in ("run source", "model ant@1", "model bee@1"):
-        assert any(part in each.why for each in unreadable), (part, unreadable)
-
-
 def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
     for name in ("source", "child", "pupil", "hidden"):
         add_run(store, name)
