@@ -27,7 +27,7 @@ from shared_store.contract.error_text import counted, nearest, shown
 from shared_store.volume import bundles
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_json
-from shared_store.volume.layout import NAME, Store, names_in
+from shared_store.volume.layout import Store, check_name, names_in
 
 CAR: Mapping[str, Any] = {
     "control_hz": 15.0,
@@ -331,11 +331,7 @@ def find(store: Store, name: str) -> StoredLeague:
 
 def create(store: Store, league: League) -> StoredLeague:
     """Create a league, permanently. Raises LeagueError for an invalid name or an existing league; OSError."""
-    if not NAME.fullmatch(league.name):
-        raise LeagueError(
-            f"league name {league.name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a "
-            "letter or digit"
-        )
+    check_name("league", league.name, LeagueError)
     taken = LeagueError(f"league {league.name} exists already, and a league is never changed; choose another name")
     if league.name in names(store):
         raise taken

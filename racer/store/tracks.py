@@ -18,7 +18,7 @@ from shared_store.contract.error_text import nearest
 from shared_store.volume import bundles
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile, open_regular, refuse_links
-from shared_store.volume.layout import NAME, Store, names_in
+from shared_store.volume.layout import Store, check_name, names_in
 
 FILE = "track.npy"
 LARGEST = 1 << 20
@@ -112,10 +112,7 @@ def add(store: Store, name: str, data: bytes, facts: Mapping[str, Any]) -> Store
         TrackError: The name is invalid, or a track of that name exists.
         OSError: The volume is full or gone.
     """
-    if not NAME.fullmatch(name):
-        raise TrackError(
-            f"track name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
-        )
+    check_name("track", name, TrackError)
     track = StoredTrack(folder_in(store) / name)
     if name in names(store):
         raise _taken(track)

@@ -104,15 +104,21 @@ def reason(error: Exception, bundle: Path) -> str:
     return str(error).removeprefix(f"bundle {bundle}: ")
 
 
+def read_document(folder: Path, name: str, called: str) -> dict[str, Any]:
+    """A JSON document of a bundle or a model, which errors call ``called``. Raises DamagedBundle."""
+    try:
+        document = read_json(folder / name)
+    except (OSError, ValueError) as error:
+        raise DamagedBundle(f"{called}: {name} can't be read ({error})") from error
+    if document is None:
+        raise DamagedBundle(f"{called}: {name} is missing")
+    return document
+
+
 def read_contract(bundle: Path) -> Contract:
     """The policy contract of a bundle. Raises DamagedBundle."""
     try:
-        document = read_json(bundle / CONTRACT)
-        if document is None:
-            raise DamagedBundle(f"bundle {bundle}: {CONTRACT} is missing")
-        return read(document)
-    except (OSError, DamagedFile) as error:
-        raise DamagedBundle(f"bundle {bundle}: {CONTRACT} can't be read ({error})") from error
+        return read(read_document(bundle, CONTRACT, f"bundle {bundle}"))
     except DocumentError as error:
         raise DamagedBundle(f"bundle {bundle}: {error}") from None
 

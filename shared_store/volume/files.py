@@ -242,8 +242,8 @@ def rename_new(hidden: Path, target: Path) -> None:
 
 def copy_file(source: Path, target: Path) -> None:
     """Copy a regular file durably. Raises as :func:`open_regular`; OSError if the volume is full or gone."""
-    with open_regular(source) as there, open(target, "wb") as here:
-        shutil.copyfileobj(there, here, 1 << 20)
+    with open_regular(source) as existing, open(target, "wb") as here:
+        shutil.copyfileobj(existing, here, 1 << 20)
         here.flush()
         os.fsync(here.fileno())
 

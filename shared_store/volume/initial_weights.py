@@ -155,9 +155,9 @@ class TeacherCopy(WeightsCopy):
     def publish(self, run: Path) -> None:
         """Move it to the run in directory ``run``, by one rename. Raises DamagedFile, OSError."""
         with self._using:
-            there = Run(run)
-            there.check_links()
-            place = there.teacher(self.teacher).checkpoints
+            existing = Run(run)
+            existing.check_links()
+            place = existing.teacher(self.teacher).checkpoints
             target = place / self.source.name
             if not target.exists():
                 place.mkdir(parents=True, exist_ok=True)

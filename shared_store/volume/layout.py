@@ -117,6 +117,14 @@ class Run:
             write_json(self.path / "run.json", description)
 
 
+def check_name(what: str, name: str, error: Callable[[str], Exception]) -> None:
+    """Raise what ``error`` makes of one line for an invalid name of a run, model or the like: a name becomes a directory."""
+    if not NAME.fullmatch(name):
+        raise error(
+            f"{what} name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
+        )
+
+
 @dataclass(frozen=True)
 class Store:
     """The shared volume at ``path``."""
@@ -214,8 +222,7 @@ class Store:
 
     def run(self, name: str) -> Run:
         """The run called ``name``, whether it exists or not. Raises StoreError for a name that can't be a directory."""
-        if not NAME.fullmatch(name):
-            raise StoreError(f"run name {name!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them")
+        check_name("run", name, StoreError)
         return Run(self.path / "runs" / name)
 
     @property

@@ -24,7 +24,7 @@ from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.evaluations import list_evaluations
 from shared_store.volume.files import hidden_folder, read_json, refuse_links, write_json
-from shared_store.volume.layout import NAME, Run, Store, names_in
+from shared_store.volume.layout import Run, Store, check_name, names_in
 
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
@@ -61,13 +61,7 @@ class Model:
 
     def facts(self) -> dict[str, Any]:
         """The content of ``model.json``. Raises DamagedBundle."""
-        try:
-            found = read_json(self.path / "model.json")
-        except (OSError, ValueError) as error:
-            raise DamagedBundle(f"model {self.reference}: model.json can't be read ({error})") from error
-        if found is None:
-            raise DamagedBundle(f"model {self.reference}: model.json is missing")
-        return found
+        return bundles.read_document(self.path, "model.json", f"model {self.reference}")
 
     def contract(self) -> Contract:
         """The contract of its policy. Raises DamagedBundle."""
@@ -79,14 +73,6 @@ class Model:
         bundles.verify(self.bundle)
 
 
-def check_name(name: str) -> None:
-    """Raise ModelError for an invalid name of a model: a name becomes a directory."""
-    if not NAME.fullmatch(name):
-        raise ModelError(
-            f"model name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
-        )
-
-
 def model_names(store: Store) -> list[str]:
     """Names of all models that have a version."""
     return [name for name in names_in(store.models) if versions(store, name)]
@@ -94,7 +80,7 @@ def model_names(store: Store) -> list[str]:
 
 def versions(store: Store, name: str) -> list[Model]:
     """The versions of a model, the newest last. Raises ModelError for an invalid name, DamagedFile for a link."""
-    check_name(name)
+    check_name("model", name, ModelError)
     folder = store.models / name
     refuse_links(folder, 2)
     entries = os.listdir(folder) if folder.is_dir() else ()
@@ -151,7 +137,7 @@ def register(
         OSError, DamagedFile: The volume is full or gone, or has a link in place of a directory.
     """
     bundle = run.exports / checkpoint.name
-    check_name(name)
+    check_name("model", name, ModelError)
     refuse_links(bundle, 2)
     if not bundle.is_dir():
         reference = f"{run.name}@{checkpoint.iteration}"

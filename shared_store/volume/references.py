@@ -39,7 +39,7 @@ _READING = (DamagedBundle, DamagedFile, ModelError, OSError)
 def references(store: Store) -> tuple[list[Needed], list[Unreadable]]:
     """All that in the store needs a run or a job, and what could not be read."""
     found = [*read("models", _of_models, store), *read("runs", _of_runs, store)]
-    of_plugins = [*read("plugins.json", lambda: (Unreadable(str(each)) for each in orphans(store)))]
+    of_plugins = [*read("plugins.json", lambda: map(Unreadable, orphans(store)))]
     for name, plugin in plugins().items():
         if plugin.references:
             of_plugins += read(f"plug-in {name}", _of_plugin, plugin.references, store)

@@ -135,8 +135,8 @@ def test_of_two_copies_of_a_package_the_one_counts_that_comes_first_on_the_path(
 )
 def test_a_plug_in_that_can_t_be_imported_is_one_line(folder: Path, line: str, words: str) -> None:
     write_package(folder, "tally", f"Plugin()\n{line}")
-    said = refusal(plugins, error=PluginError)
-    assert said.startswith(f"plug-in tally of the package tally: {words}") and "\n" not in said
+    message = refusal(plugins, error=PluginError)
+    assert message.startswith(f"plug-in tally of the package tally: {words}") and "\n" not in message
 
 
 @pytest.mark.parametrize(
@@ -152,8 +152,8 @@ def test_a_part_that_can_t_be_used_is_named_with_its_plug_in_and_field(
     folder: Path, code: str, kind: Any, words: str
 ) -> None:
     write_package(folder, "tally", "Plugin(references='tally_parts:part')", code)
-    said = refusal(load, "tally_parts:part", kind, error=PluginError)
-    assert said.startswith(f"plug-in tally: references: tally_parts:part {words}") and "\n" not in said
+    message = refusal(load, "tally_parts:part", kind, error=PluginError)
+    assert message.startswith(f"plug-in tally: references: tally_parts:part {words}") and "\n" not in message
 
 
 def test_rules_lack_nothing(folder: Path) -> None:

@@ -96,12 +96,12 @@ MALFORMED = {
 }
 
 
-@pytest.mark.parametrize("said", MALFORMED)
-def test_a_malformed_contract_is_refused_in_one_line(said: str) -> None:
-    change = MALFORMED[said]
+@pytest.mark.parametrize("message", MALFORMED)
+def test_a_malformed_contract_is_refused_in_one_line(message: str) -> None:
+    change = MALFORMED[message]
     with pytest.raises(DocumentError) as caught:
         read(document(change))
-    assert str(caught.value) == f"contract.json: {said}"
+    assert str(caught.value) == f"contract.json: {message}"
 
 
 def test_a_contract_of_format_1_is_read_with_fewer_entries() -> None:
@@ -114,9 +114,9 @@ def test_a_contract_of_format_1_is_read_with_fewer_entries() -> None:
         for each in found["commands"]:
             del each["quantity"], each["library"]
 
-    there = read(document(older))
-    assert there.format == 1 and not there.groups[0].terms[0].library and there.actions[0].range is None
-    assert differences(there, CONTRACT) == [] == differences(CONTRACT, there)
+    existing = read(document(older))
+    assert existing.format == 1 and not existing.groups[0].terms[0].library and existing.actions[0].range is None
+    assert differences(existing, CONTRACT) == [] == differences(CONTRACT, existing)
 
 
 def test_values_that_follow_from_a_robot_s_file_can_be_left_out_and_meanings_can_not() -> None:
@@ -126,8 +126,8 @@ def test_values_that_follow_from_a_robot_s_file_can_be_left_out_and_meanings_can
         )
         found["groups"][0]["terms"][0].update(offset=[0.4, -0.4])
 
-    there = read(document(changed))
-    assert len(differences(CONTRACT, there)) == 10 and differences(CONTRACT, there, of_robot=False) == []
+    existing = read(document(changed))
+    assert len(differences(CONTRACT, existing)) == 10 and differences(CONTRACT, existing, of_robot=False) == []
     other = read(document(lambda found: found["actions"][0].update(kind="effort", unit="N m", damping=1.0)))
     assert differences(CONTRACT, other, of_robot=False) == [
         "action 0: left_knee kind position became effort",

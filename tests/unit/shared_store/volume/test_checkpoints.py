@@ -291,9 +291,9 @@ def test_damage_is_named_and_the_checkpoint_before_it_is_used(run: Run, damage: 
     commit(run, 25)
     harm(commit(run, 50).path)
     named: list[tuple[str, str]] = []
-    told = newest(run, damaged=lambda checkpoint, error: named.append((checkpoint.name, str(error))))
+    result = newest(run, damaged=lambda checkpoint, error: named.append((checkpoint.name, str(error))))
     [(name, message)] = named
-    assert (told, name) == ("00000025-e1", "00000050-e1")
+    assert (result, name) == ("00000025-e1", "00000050-e1")
     assert message.startswith(f"checkpoint 00000050-e1: {said}")
 
 
@@ -416,8 +416,8 @@ def test_a_commit_takes_its_writers_digests_and_publishes_no_notes(run: Run) -> 
     (writer.path / "rank-0.pt").write_bytes(b"state")
     (writer.path / ".note").touch()
     (writer.path / "manifest.json").write_text("of an earlier try")
-    there = CheckpointWriter(run, 3, 2)
-    made = there.commit({}, digests={"rank-0.pt": STATE})
+    existing = CheckpointWriter(run, 3, 2)
+    made = existing.commit({}, digests={"rank-0.pt": STATE})
     made.verify()
     assert sorted(os.listdir(made.path)) == ["manifest.json", "rank-0.pt"] and made.manifest["created"] > 1e9
     assert (made.path.name, made.iteration, made.epoch) == ("00000003-e2", 3, 2)

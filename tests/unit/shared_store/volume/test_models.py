@@ -51,7 +51,7 @@ def test_a_sealed_bundle_verifies_and_lists_every_other_file(bundle: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (lambda path: flip(path / "robot" / "arm.xml", 3), r"the content of robot/arm\.xml was altered"),
         (lambda path: (path / "policy.onnx").write_bytes(b"weight"), r"policy\.onnx has 6 bytes, 7 were written"),
@@ -63,9 +63,9 @@ def test_a_sealed_bundle_verifies_and_lists_every_other_file(bundle: Path) -> No
         (lambda path: (path / "manifest.json").write_text("{"), r"manifest\.json can't be read"),
     ],
 )
-def test_a_difference_is_named_in_one_line(bundle: Path, damage: Callable[[Path], Any], said: str) -> None:
+def test_a_difference_is_named_in_one_line(bundle: Path, damage: Callable[[Path], Any], message: str) -> None:
     damage(bundle)
-    with pytest.raises(DamagedBundle, match=said) as caught:
+    with pytest.raises(DamagedBundle, match=message) as caught:
         bundles.verify(bundle)
     assert "\n" not in str(caught.value)
 
@@ -157,8 +157,8 @@ def test_versions_count_up_and_existing_ones_stay(store: Store) -> None:
 def test_a_registered_checkpoint_is_registered_again_only_on_request(store: Store) -> None:
     run, checkpoint = exported(store)
     first = models.register(store, "ant", run, checkpoint, {}, again=False)
-    said = r"^the same checkpoint is ant@1 already; --again registers it once more$"
-    with pytest.raises(AlreadyRegistered, match=said):
+    message = r"^the same checkpoint is ant@1 already; --again registers it once more$"
+    with pytest.raises(AlreadyRegistered, match=message):
         models.register(store, "ant", run, checkpoint, {}, again=False)
     assert os.listdir(store.models / "ant") == ["1"], "nothing is made"
     assert models.register(store, "other", run, checkpoint, {}, again=False).reference == "other@1"
@@ -177,11 +177,11 @@ def register_five(path: str, number: str) -> list[int]:
 def test_processes_that_register_at_once_get_a_version_each(store: Store) -> None:
     exported(store)
     answers = at_once(register_five, [(str(store.path), number) for number in "0123"])
-    given = {version: str(number) for number, versions in enumerate(answers) for version in versions}
-    assert sorted(given) == list(range(1, 21)), "twenty versions, none of them twice"
+    values = {version: str(number) for number, versions in enumerate(answers) for version in versions}
+    assert sorted(values) == list(range(1, 21)), "twenty versions, none of them twice"
     for model in models.versions(store, "ant"):
         model.verify()
-        assert model.facts()["registered_by"] == given[model.version]
+        assert model.facts()["registered_by"] == values[model.version]
     assert sorted(os.listdir(store.models / "ant"), key=int) == [str(number) for number in range(1, 21)]
 
 

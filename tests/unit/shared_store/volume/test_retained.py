@@ -123,16 +123,16 @@ def test_directories_that_may_not_be_written_are_kept_where_they_are_and_removed
 
 def test_what_can_t_be_removed_is_named_and_the_rest_goes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     stuck, other = logged(store, "stuck"), logged(store, "other")
-    [there, _], _ = trash.throw_away(store, [stuck.path, other.path])
+    [existing, _], _ = trash.throw_away(store, [stuck.path, other.path])
     is_held = True
     remove = shutil.rmtree
 
     def held(path: Path, ignore_errors: bool = False) -> None:
-        if not (is_held and path == there):
+        if not (is_held and path == existing):
             remove(path, ignore_errors=ignore_errors)
 
     monkeypatch.setattr("shutil.rmtree", held)
-    assert trash.empty(store) == [there]
+    assert trash.empty(store) == [existing]
     is_held = False
     assert trash.empty(store) == []
 
