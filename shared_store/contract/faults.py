@@ -23,21 +23,13 @@ _CHAINED = re.compile(
 _START = "Traceback (most recent call last):"
 _FRAME = re.compile(r'  File "(.+)", line ([0-9]{1,9})(?:, in .+)?')
 _EXCEPTION = re.compile(r"([A-Za-z_][\w.]*)(?:: (.*))?")
-_OUTSIDE = (
-    "GangError",
-    "StaleEpoch",
-    "DamagedCheckpoint",
-    "DamagedFile",
-    "StoreError",
-    "KeyboardInterrupt",
-    "SystemExit",
-)
-"""Names of types, without their modules, of what ends a rank from outside."""
-_OUTSIDE_TYPES = (OSError, MemoryError, EOFError)
+_OUTSIDE_TYPES = (OSError, MemoryError, EOFError, KeyboardInterrupt, SystemExit)
 _OUTSIDE_NAMES = re.compile(
+    r"^(?:GangError|StaleEpoch|StoreError|DamagedCheckpoint|DamagedFile)$|"
     r"Memory|Connect|Timeout|TimedOut|Network|Socket|HTTP|SSL|URL|Unavailable|Retry|gaierror|Dist[A-Z]\w*Error|DistError|Accelerator|"
     r"Subprocess|CalledProcess|BrokenProcess|BrokenExecutor"
 )
+"""In names of types, without their modules, of what ends a rank from outside."""
 _OUTSIDE_WORDS = re.compile(
     r"out of memory|failed to allocate|can't allocate memory|cannot allocate memory|CUDA (?:error|driver)|cuDNN|cuBLAS|NCCL|gloo|by peer|"
     r"connection (?:closed|reset|refused|aborted)|timed out|broken pipe|no space left|input/output error|stale file handle|"
@@ -114,12 +106,10 @@ def _last(text: str) -> tuple[str, str, str, int] | None:
 
 
 def _is_from_outside(name: str, message: str, file: str) -> bool:
-    short = name.rpartition(".")[2]
     known = getattr(builtins, name, None)
     return (
-        short in _OUTSIDE
-        or (isinstance(known, type) and issubclass(known, _OUTSIDE_TYPES))
-        or _OUTSIDE_NAMES.search(short) is not None
+        (isinstance(known, type) and issubclass(known, _OUTSIDE_TYPES))
+        or _OUTSIDE_NAMES.search(name.rpartition(".")[2]) is not None
         or _OUTSIDE_WORDS.search(message) is not None
         or _COLLECTIVES in file
     )

@@ -11,7 +11,7 @@ import re
 import sys
 from collections.abc import Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass
 from functools import cache, reduce
 from importlib import import_module
 
@@ -261,21 +261,12 @@ def _words(error: BaseException) -> str:
 
 def _declared_in(place: str) -> str:
     """The plug-in and the field that name a part, for errors."""
+    quoted = repr(place), repr(place.removesuffix(":register"))
     for name, plugin in plugins().items():
         for field, value in vars(plugin).items():
-            if any(place in (text, f"{text}:register") for text in _texts(value)):
+            if any(each in repr(value) for each in quoted):  # a text, or one of those in it
                 return f"plug-in {name}: {field}"
     return "plug-in"
-
-
-def _texts(value: object) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, tuple):
-        for each in value:
-            yield from _texts(each)
-    elif is_dataclass(value):
-        yield from _texts(tuple(vars(value).values()))
 
 
 @cache

@@ -83,40 +83,35 @@ class RunGroup:
 
     def describe(self) -> dict[str, Any]:
         """As JSON values."""
+        successes = [each.get("success") for each in self.evaluations]
+        shares = [each.get("share") for each in successes if isinstance(each, Mapping)]
         return {
             "runs": [run.name for run in self.runs],
             "seeds": [run.train.get("seed") for run in self.runs],
             "task": self.runs[0].train.get("task"),
             **{key: _spread(self.numbers(key)) for key in ("iteration", "env_steps", "reward", "episode_length")},
             "evaluated": _spread([each["mean_return"] for each in self.evaluations]),
-            "success": _spread(self._successes()),
+            "success": _spread([float(share) for share in shares if isinstance(share, int | float)]),
             "evaluations": self.evaluations,
         }
 
     def cells(self) -> list[str]:
         """A row of the table, by :data:`COLUMNS`."""
-        seeds = ", ".join(str(run.train.get("seed", "-")) for run in self.runs)
-        evaluated = [each["mean_return"] for each in self.evaluations]
-        shares = [100 * share for share in self._successes()]
+        facts = self.describe()
         returns = self.evaluations[0].get("return") if len(self.evaluations) == 1 else None
         high = returns.get("high") if isinstance(returns, Mapping) else None
-        single = f"{evaluated[0]:.2f} ± {high - evaluated[0]:.2f}" if isinstance(high, int | float) else None
+        mean = facts["evaluated"] and facts["evaluated"]["mean"]
         return [
             self.label,
-            seeds,
+            ", ".join(str(run.train.get("seed", "-")) for run in self.runs),
             str(self.runs[0].train.get("task", "-")),
-            _shown(self.numbers("iteration"), ".0f"),
-            _shown(self.numbers("env_steps"), ",.0f"),
-            _shown(self.numbers("reward"), ".2f"),
-            _shown(self.numbers("episode_length"), ".1f"),
-            single or _shown(evaluated, ".2f"),
-            f"{_shown(shares, '.1f')} %" if shares else "-",
+            _shown(facts["iteration"], ".0f"),
+            _shown(facts["env_steps"], ",.0f"),
+            _shown(facts["reward"], ".2f"),
+            _shown(facts["episode_length"], ".1f"),
+            f"{mean:.2f} ± {high - mean:.2f}" if isinstance(high, int | float) else _shown(facts["evaluated"], ".2f"),
+            f"{_shown(facts['success'], '.1f', 100)} %" if facts["success"] else "-",
         ]
-
-    def _successes(self) -> list[float]:
-        successes = [each.get("success") for each in self.evaluations]
-        shares = [each.get("share") for each in successes if isinstance(each, Mapping)]
-        return [float(share) for share in shares if isinstance(share, int | float)]
 
     def curve(self, metric: str = "reward", at: Sequence[float] | None = None) -> list[tuple[float, float, float, int]]:
         """Steps, mean of a metric (the return) over its runs, their standard deviation, and how many they are.
@@ -224,8 +219,8 @@ def _spread(values: Sequence[float]) -> dict[str, float | None] | None:
     return {"mean": fmean(values), "std": stdev(values) if len(values) > 1 else None} if values else None
 
 
-def _shown(values: Sequence[float], pattern: str) -> str:
-    if not values:
+def _shown(spread: Mapping[str, float | None] | None, pattern: str, scale: float = 1) -> str:
+    if not spread or spread["mean"] is None:
         return "-"
-    mean = format(fmean(values), pattern)
-    return f"{mean} ± {format(stdev(values), pattern)}" if len(values) > 1 and len(set(values)) > 1 else mean
+    shown = format(scale * spread["mean"], pattern)
+    return f"{shown} ± {format(scale * spread['std'], pattern)}" if spread["std"] else shown

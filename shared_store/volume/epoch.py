@@ -15,7 +15,7 @@ import socket
 import time
 from dataclasses import asdict, dataclass
 
-from shared_store.volume.files import open_regular, refuse_links, sync_directory, write_atomic
+from shared_store.volume.files import open_regular, read_json, refuse_links, sync_directory, write_atomic
 from shared_store.volume.layout import Run, StoreError
 
 LARGEST_EPOCH = 10**15 - 1
@@ -89,10 +89,9 @@ def raise_epoch(run: Run, epoch: int, claim: Claim | None = None) -> None:
 def read_claim(run: Run, epoch: int) -> Claim | None:
     """The open attempt that has ``epoch``; None if it is closed, unknown or damaged. Raises OSError."""
     try:
-        with open_regular(run.path / f"EPOCH.{epoch}") as file:
-            value = json.loads(file.read(_LONGEST_CLAIM))
+        value = read_json(run.path / f"EPOCH.{epoch}", _LONGEST_CLAIM) or {}
         return Claim(str(value["controller"]), str(value["job"]), int(value["attempt"]))
-    except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError):
         return None
 
 

@@ -75,18 +75,15 @@ def beside(spec: Mapping[str, Any]) -> tuple[dict[str, Any], dict[Reference, str
     for size, section, field, value in sorted(found, key=lambda each: each[0], reverse=True):
         if size <= _OF_REFERENCE or _HALF.search(value["text"]):
             continue
-        if _size_of(result) <= IN_DEFINITION:
+        again = {
+            key: spec[key] for key in ("environment", "secrets", "command") if key in spec
+        }  # as the definition has them
+        if size_in_definition(result) + len(json.dumps(again)) <= IN_DEFINITION:
             break
         kept = {"file": str(value.get("file") or field), "sha256": digest_of(value["text"])}
         result[section] = {**result[section], "config": {**result[section]["config"], field: kept}}
         texts[_reference(section, field, kept)] = value["text"]
     return result, texts
-
-
-def _size_of(spec: Mapping[str, Any]) -> int:
-    """Bytes of a definition that depend on its spec: that itself, and what the definition has of it once more."""
-    again = {key: spec[key] for key in ("environment", "secrets", "command") if key in spec}
-    return size_in_definition(spec) + len(json.dumps(again))
 
 
 def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str, Any]:

@@ -51,17 +51,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         (lambda: Plugin(folders="tally"), "folders: expected a tuple, found 'tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(folders=(3,)), "folders: expected the name of a folder, of letters, digits, '_' and '-', found 3"),  # type: ignore[arg-type]
         (lambda: Plugin(folders=("../x",)), "folders: expected the name of a folder, of letters, digits, '_' and '-', found '../x'"),
-        (lambda: Plugin(folders=("plugins.json",)), "folders: expected the name of a folder, of letters, digits, '_' and '-', found 'plugins.json'"),
         (lambda: Plugin(folders=("runs",)), "folders: runs is a folder of Muster's own; choose another name"),
         (lambda: Plugin(run_folders=("logs",)), "run_folders: logs is a folder of Muster's own; choose another name"),
         (lambda: Plugin(operations=("FETCH api/tally",)), "operations: expected METHOD /path, such as GET /api/notes, found 'FETCH api/tally'"),
-        (lambda: Plugin(operations="GET /api/tally"), "operations: expected a tuple, found 'GET /api/tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(routers=("tally.routes",)), "routers: expected module:name, found 'tally.routes'"),
-        (lambda: Plugin(navigation="/tally"), "navigation: expected a tuple, found '/tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(navigation=("Tally", "/tally")), "navigation: expected tuples of 2 texts, found 'Tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(navigation=(("Tally", "tally"),)), "navigation: expected a path that begins with /, found 'tally'"),
         (lambda: Plugin(commands=(("tally", "m"),)), "commands: expected Command(…), found ('tally', 'm')"),  # type: ignore[arg-type]
-        (lambda: Plugin(sections=("race",)), "sections: expected JobSection(…), found 'race'"),  # type: ignore[arg-type]
         (lambda: Plugin(references=5), "references: expected module:name, found 5"),  # type: ignore[arg-type]
         (lambda: Plugin(templates="a b"), "templates: expected a module, such as package.module, found 'a b'"),
         (lambda: Command("Tally", "t.m", "Runs", "Count."), "Command.name: expected a name of lower-case letters, digits and '-', found 'Tally'"),
@@ -129,7 +125,6 @@ def test_of_two_copies_of_a_package_the_one_counts_that_comes_first_on_the_path(
     [
         ("raise SystemExit(3)", "tally:PLUGIN can't be imported (it exits with 3)"),
         ("1 / 0", "tally:PLUGIN can't be imported (division by zero)"),
-        ("raise ValueError", "tally:PLUGIN can't be imported (ValueError)"),
         ("PLUGIN = 3", "tally:PLUGIN is no Plugin of shared_store.contract.plugins"),
     ],
 )
@@ -143,7 +138,6 @@ def test_a_plug_in_that_can_t_be_imported_is_one_line(folder: Path, line: str, w
     ("code", "kind", "words"),
     [
         ("", object, "can't be imported (module 'tally_parts' has no attribute 'part')"),
-        ("def broken(:", object, "can't be imported (invalid syntax (tally_parts.py, line 1))"),
         ("import sys; sys.exit('no')", object, "can't be imported (it exits with 'no')"),
         ("part = 3", str, "is int, and no str"),
     ],

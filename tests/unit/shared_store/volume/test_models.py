@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from shared_store.volume import bundles, models
-from shared_store.volume.bundles import DamagedBundle, publish, seal
+from shared_store.volume.bundles import DamagedBundle, seal
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run, Store
@@ -207,26 +207,6 @@ def test_the_leftovers_of_a_killed_registration_are_deleted_by_its_controller_s_
     left = [path.name for path in store.models.glob("*/.*")]
     assert [name.split(".")[1] for name in left] == ["b2"], "another controller's may go on"
     models.find(store, "ant").verify()
-
-
-def test_a_version_is_never_published_over_another(store: Store, tmp_path: Path) -> None:
-    exported(store)
-    model = register(store)
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "policy.onnx").write_bytes(b"worse")
-    with pytest.raises(FileExistsError):
-        publish(tmp_path / "other", model.path)
-    model.verify()
-
-
-@pytest.mark.parametrize("name", ["", ".", "..", "../ant", "a/b", ".hidden", "-x", "a b", "a@1", "ä", "x" * 129, "a\n"])
-def test_a_name_that_can_not_be_a_directory_is_refused(store: Store, name: str) -> None:
-    exported(store)
-    with pytest.raises(ModelError, match=r"^model name .*: use letters, digits"):
-        register(store, name)
-    with pytest.raises(ModelError):
-        models.find(store, name)
-    assert not store.models.exists()
 
 
 def test_damage_of_a_model_is_found(store: Store) -> None:
