@@ -69,7 +69,7 @@ def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def keep_for_evaluation(run: Run, checkpoint: str) -> None:
-    """Protect the checkpoint of a pending evaluation from retention, in place of an earlier one. Raises as :func:`evaluation_is_over`."""
+    """Protect the checkpoint of a pending evaluation from retention, in place of an earlier one. Raises as :func:`release_from_evaluation`."""
     refuse_links(run.evaluations, 2)
     write_atomic(run.evaluations / f"{checkpoint}.wanted", b"")
     for path in run.evaluations.glob("*.wanted"):
@@ -77,13 +77,13 @@ def keep_for_evaluation(run: Run, checkpoint: str) -> None:
             path.unlink(missing_ok=True)
 
 
-def evaluation_is_over(run: Run, checkpoint: str) -> None:
+def release_from_evaluation(run: Run, checkpoint: str) -> None:
     """End the protection of :func:`keep_for_evaluation`. Raises DamagedFile if a link leads out of the run, OSError."""
     refuse_links(run.evaluations, 2)
     (run.evaluations / f"{checkpoint}.wanted").unlink(missing_ok=True)
 
 
-def wanted_checkpoints(run: Run) -> set[str]:
+def pending_checkpoints(run: Run) -> set[str]:
     """Names of the checkpoints of pending evaluations, from :func:`keep_for_evaluation`."""
     return {path.stem for path in run.evaluations.glob("*.wanted")}
 
@@ -96,7 +96,7 @@ def kept_checkpoints(run: Run) -> set[str]:
     """
     # also what can't be read: keeping is safe
     kept = {checkpoint for _, checkpoint, summary in _summaries(run) if summary is None or summary.get("keep", True)}
-    return kept | wanted_checkpoints(run)
+    return kept | pending_checkpoints(run)
 
 
 def in_one_line(summary: Mapping[str, Any]) -> str:

@@ -122,7 +122,7 @@ def json_object(data: bytes | str, name: str) -> dict[str, Any]:
     return value
 
 
-def is_there(path: Path) -> bool:
+def path_exists(path: Path) -> bool:
     """Whether there is anything, also a link that leads nowhere. Raises OSError where that can't be seen."""
     try:
         os.lstat(path)
@@ -178,10 +178,10 @@ def _check_plain(value: object, data: bytes) -> None:
     """Raise ValueError for a value that can be read, but not written again as JSON."""
     level = [value]
     for _ in range(DEEPEST_JSON):
-        if any(isinstance(each, float) and not math.isfinite(each) for each in level):
-            raise ValueError("a number is too large")
-        if any(isinstance(each, int) and each.bit_length() > LONGEST_WHOLE for each in level):
-            raise ValueError("a number is too large")  # no float can be made of it
+        for each in level:
+            is_large = isinstance(each, int) and each.bit_length() > LONGEST_WHOLE  # no float can be made of it
+            if is_large or (isinstance(each, float) and not math.isfinite(each)):
+                raise ValueError("a number is too large")
         level = [
             inner
             for each in level

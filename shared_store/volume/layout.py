@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from shared_store.contract.plugins import OF_RUN, plugins
-from shared_store.volume.files import DamagedFile, is_there, read_json, refuse_links, write_json
+from shared_store.volume.files import DamagedFile, path_exists, read_json, refuse_links, write_json
 
 FORMAT = 1
 """Version of the layout; a store with a newer one is refused."""
@@ -106,7 +106,7 @@ class Run:
     def is_missing(self) -> bool:
         """Whether the store can be read and lacks the run; False if that is uncertain, for example while the volume is away."""
         try:
-            return not is_there(self.path / "run.json") and os.path.lexists(self.path.parent.parent / "store.json")
+            return not path_exists(self.path / "run.json") and os.path.lexists(self.path.parent.parent / "store.json")
         except OSError:
             return False
 

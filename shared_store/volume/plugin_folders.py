@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from shared_store.contract.error_text import shown
 from shared_store.contract.plugins import plugins
-from shared_store.volume.files import DamagedFile, is_there, read_json, write_json
+from shared_store.volume.files import DamagedFile, path_exists, read_json, write_json
 from shared_store.volume.layout import NAME, Store
 
 _FILE = "plugins.json"
@@ -30,7 +30,7 @@ def orphans(store: Store) -> Iterator[str]:
             raise DamagedFile(
                 f'{path}: {shown(name)}: expected a list of names of folders, such as ["notes"]; correct it, or remove the entry'
             )
-        if existing := [str(store.path / each) for each in folders if is_there(store.path / each)]:
+        if existing := [str(store.path / each) for each in folders if path_exists(store.path / each)]:
             noun, verb = ("folder", "needs") if len(existing) == 1 else ("folders", "need")
             yield (
                 f"plug-in {shown(name)} is not installed, so what its {noun} {' and '.join(existing)} {verb} can't be known; "

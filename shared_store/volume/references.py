@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 from shared_store.contract.plugins import PluginError, failed, load, plugins
 from shared_store.volume import models
 from shared_store.volume.bundles import DamagedBundle
-from shared_store.volume.files import DamagedFile, is_there, read_json
+from shared_store.volume.files import DamagedFile, path_exists, read_json
 from shared_store.volume.layout import LARGEST_DESCRIPTION, Run, Store, names_in
 from shared_store.volume.models import Model, ModelError
 from shared_store.volume.plugin_folders import orphans
@@ -82,10 +82,10 @@ def _of_runs(store: Store) -> Found:
 
 
 def _of_run(run: Run) -> Found:
-    if is_there(run.parent):
+    if path_exists(run.parent):
         described = read_json(run.path / "run.json", LARGEST_DESCRIPTION) or {}
         yield from needed_run(part(described.get("parent"), "run"), f"run {run.name} is a clone of it")
-    if is_there(run.path / "teachers"):
+    if path_exists(run.path / "teachers"):
         for teacher in names_in(run.path / "teachers"):
             yield from needed_run(teacher, f"it is the teacher of run {run.name}")
 

@@ -99,7 +99,7 @@ def test_retention_keeps_of_evaluations_that_keep_nothing_the_best_and_what_is_s
     assert retain(run, keep=1) == ["00000012-e1"]
     evaluations.keep_for_evaluation(run, "00000015-e1")
     assert retain(run, keep=1) == ["00000009-e1"], "one waits at a time"
-    evaluations.evaluation_is_over(run, "00000015-e1")
+    evaluations.release_from_evaluation(run, "00000015-e1")
     evaluate(run, "00000015-e1-1f2e3d4c", 8.0, keep=False)
     assert retain(run, keep=1) == ["00000003-e1"], "there is a better one"
     assert [each.iteration for each in list_checkpoints(run)] == [6, 15], "of the greatest score, the newest"
