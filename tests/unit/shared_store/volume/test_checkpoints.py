@@ -68,9 +68,6 @@ def sweep_up(root: Path) -> None:
     sweep(Run(root))
 
 
-# -- commit -----------------------------------------------------------------------------------------------------------
-
-
 def test_a_committed_checkpoint_lists_its_contents(run: Run) -> None:
     checkpoint = commit(run, 25, epoch=3, world_size=2, worlds=64, iteration=7, files={})
     assert (checkpoint.name, checkpoint.iteration, checkpoint.epoch) == ("00000025-e3", 25, 3)
@@ -162,9 +159,6 @@ def test_an_uncommitted_checkpoint_is_not_listed_and_one_that_is_gone_can_not_be
     assert list_checkpoints(run) == []
 
 
-# -- order and choice -------------------------------------------------------------------------------------------------
-
-
 def test_nothing_is_committed_into_the_mount_point_of_a_volume_that_is_gone(run: Run) -> None:
     writer = CheckpointWriter(run, 50, 1)
     away = run.path.rename(run.path.with_name("away"))
@@ -196,16 +190,12 @@ def test_a_chosen_checkpoint_stands_until_the_job_has_one_of_its_own(run: Run) -
 
 
 def test_a_choice_that_is_missing_or_damaged_is_never_replaced_by_a_guess(run: Run) -> None:
-    damaged = commit(run, 25)
-    commit(run, 50)
+    damaged, _ = commit(run, 25), commit(run, 50)
     with pytest.raises(DamagedCheckpoint, match="checkpoint 00000033-e1: not in run ant"):
         newest_checkpoint(run, chosen="00000033-e1", chosen_since=2)
     (damaged.path / "rank-0.pt").unlink()
     with pytest.raises(DamagedCheckpoint, match=r"00000025-e1: rank-0.pt is missing"):
         newest_checkpoint(run, chosen="00000025-e1", chosen_since=2)
-
-
-# -- damage -----------------------------------------------------------------------------------------------------------
 
 
 def edit(**changes: Any) -> Callable[[Path], Any]:
@@ -297,9 +287,14 @@ def test_damage_is_named_and_the_checkpoint_before_it_is_used(run: Run, damage: 
     assert message.startswith(f"checkpoint 00000050-e1: {said}")
 
 
-def test_a_damaged_checkpoint_is_set_aside_under_a_name_of_its_own_and_not_deleted(run: Run) -> None:
+def test_a_damaged_checkpoint_is_set_aside_durably_under_a_name_of_its_own_and_not_deleted(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for expected in ("00000050-e1.damaged", "00000050-e1.damaged-2", "00000050-e1.damaged-3"):
-        moved = set_aside(commit(run, 50))
+        checkpoint, seen = commit(run, 50), durable_operations(monkeypatch)
+        moved = set_aside(checkpoint)
+        monkeypatch.undo()
+        assert seen == [("rename", str(moved)), ("fsync", str(run.checkpoints))]
         assert moved.name == expected and (moved / "rank-0.pt").exists() and list_checkpoints(run) == []
     commit(run, 50).verify()
 
@@ -310,9 +305,6 @@ def test_setting_aside_killed_at_any_step_loses_nothing(run: Run, tmp_path: Path
     for left in killed_at_every_step(set_newest_aside, run.path, tmp_path / "work"):
         found = {name for name in os.listdir(left / "checkpoints") if name.startswith("0")}
         assert found in ({"00000025-e1", "00000050-e1"}, {"00000025-e1", "00000050-e1.damaged"})
-
-
-# -- sweeping and retention -------------------------------------------------------------------------------------------
 
 
 def test_sweeping_deletes_only_leftovers_of_crashes(run: Run) -> None:
@@ -351,6 +343,7 @@ RETAINED: dict[str, tuple[list[dict[str, Any]], int | None, list[int]]] = {
         2,
         [20, 40, 50],
     ),
+    "the newest whatever is asked for": ([{}] * 3, 0, [30]),
     "all where all are to be kept": ([{}] * 4, None, [10, 20, 30, 40]),
     **{
         f"a reward of {reward} is never the best": (
@@ -369,12 +362,6 @@ def test_retention_keeps(run: Run, case: str) -> None:
     for number, each in enumerate(facts, 1):
         commit(run, 10 * number, keep=keep, **each)
     assert names(run) == [f"{iteration:08d}-e1" for iteration in kept]
-
-
-def test_retention_never_deletes_the_newest(run: Run) -> None:
-    commit(run, 10)
-    commit(run, 20)
-    assert retain(run, 0) == ["00000010-e1"] and names(run) == ["00000020-e1"]
 
 
 def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: Run) -> None:
@@ -440,13 +427,6 @@ def test_a_commit_sweeps_what_is_older_than_itself(run: Run) -> None:
     ]
     commit(run, 7, epoch=2)
     assert sorted(os.listdir(run.checkpoints)) == [".00000001-e3.tmp", "00000007-e2", "LATEST"]
-
-
-def test_what_is_set_aside_is_durable(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    checkpoint = commit(run, 5)
-    seen = durable_operations(monkeypatch)
-    moved = set_aside(checkpoint)
-    assert seen == [("rename", str(moved)), ("fsync", str(run.checkpoints))]
 
 
 def test_an_attempt_that_lost_its_run_in_the_rename_prunes_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
