@@ -113,7 +113,7 @@ FILES: dict[str, str] = {
     "name: a\nevaluate: {run: x, checkpont: 3}\n": ":2: evaluate.checkpont: unknown key; did you mean checkpoint?",
     "": f": {MAPPING} nothing",
     "- a\n": f": {MAPPING} a list",
-    "text": f": {MAPPING} a text ('text')",
+    "text": f": {MAPPING} a string ('text')",
     "command: [x]\n": ": name: is required",
     "name: a\n": f": {ONE_OF} none",
     f"name: a\ncommand: [x]\n{TRAIN}\n": f": {ONE_OF} train and command",
