@@ -34,27 +34,22 @@ class _OldNames:
         moved = self._new(package) if package else None
         return moved and f"{moved}.{module}"
 
-    def _found(self, name: str) -> ModuleSpec | None:
-        new = self._new(name)
-        if new is None:
+    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        if (new := self._new(name)) is None:
             return None
         from importlib.util import find_spec  # few processes need it
 
         try:
-            return find_spec(new)
+            found = find_spec(new)
         except ModuleNotFoundError:  # the package in which it is now is not installed
             return None
-
-    def find_spec(self, name: str, path: object = None, target: object = None) -> ModuleSpec | None:
-        found = self._found(name)
-        if found is None:
-            return None
-        spec = ModuleSpec(name, self, origin=found.origin)  # type: ignore[arg-type]
-        spec.submodule_search_locations = found.submodule_search_locations
+        spec = found and ModuleSpec(name, self, origin=found.origin)  # type: ignore[arg-type]
+        if spec and found:
+            spec.submodule_search_locations, spec.loader_state = found.submodule_search_locations, found
         return spec
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
-        module = import_module(self._new(spec.name) or spec.name)
+        module = import_module(spec.loader_state.name)
         self._specs[spec.name] = module.__spec__
         return module
 
@@ -70,9 +65,9 @@ class _OldNames:
 
     def get_code(self, name: str) -> CodeType | None:
         """For ``python -m`` with an old name."""
-        found = self._found(name)
-        loader: Any = found and found.loader
-        code: CodeType | None = loader and loader.get_code(found and found.name)
+        spec = self.find_spec(name)
+        loader: Any = spec and spec.loader_state.loader
+        code: CodeType | None = loader and loader.get_code(spec and spec.loader_state.name)
         return code
 
 

@@ -116,7 +116,7 @@ def _changes(rules: EvaluationRules, job: Job, kind: str, task_type: type[Task],
     if ranks > 1:
         raise UserError(f"{kind}: it runs on one node with at most one GPU, not on {ranks} ranks")
     if not isinstance(job.section.get("config") or {}, dict):
-        raise UserError(f"{kind}.config: expected a mapping")
+        raise UserError(f"{kind}.config: expected an object")
     return rules.changes(job.section)
 
 

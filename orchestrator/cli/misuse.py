@@ -17,8 +17,8 @@ Misuse: type[Exception] = typer.BadParameter.__mro__[2]
 """The parser's exception. Typer takes it from click or has its own, depending on the version."""
 
 _EXPECTED = {
-    "int_parsing": "a whole number",
-    "int_from_float": "a whole number",
+    "int_parsing": "an integer",
+    "int_from_float": "an integer",
     "float_parsing": "a number",
     "bool_parsing": "true or false",
 }

@@ -20,7 +20,7 @@ from shared_store.contract.error_text import counted
 from shared_store.contract.policy import read
 from shared_store.contract.policy_changes import differences, robot_changes
 from shared_store.volume.bundles import POLICY
-from shared_store.volume.evaluations import in_one_line, told_changes
+from shared_store.volume.evaluations import changes_in_lines, in_one_line
 
 MODELS = Resource(
     {
@@ -97,7 +97,7 @@ def show(model: options.ModelArgument, store: options.StoreOption = None, as_jso
         width=12,
     )
     for evaluation in found.get("evaluations") or []:
-        changed = ", ".join(f"{place} {value}" for place, value in told_changes(evaluation))
+        changed = ", ".join(f"{place} {value}" for place, value in changes_in_lines(evaluation))
         seed = evaluation.get("seed")
         worlds = "at the end of the training" if seed is None else f"seed {seed}"
         echo(f"  evaluation:  {in_one_line(evaluation)}, {worlds}{f', with {changed}' if changed else ''}")

@@ -15,7 +15,7 @@ from orchestrator.services import runs
 from shared_store.contract.error_text import counted
 from shared_store.contract.phases import Phase
 from shared_store.volume.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
-from shared_store.volume.evaluations import by_checkpoint, told_changes
+from shared_store.volume.evaluations import by_checkpoint, changes_in_lines
 from shared_store.volume.layout import Run
 from shared_store.volume.learning_metrics import in_words
 from shared_store.volume.metrics import finite, warnings_of
@@ -155,7 +155,7 @@ def evaluations_of(summaries: Iterable[Mapping[str, Any]], run: str) -> Table:
             "result": _result(each),
             "success": "" if share is None else f"{100 * share:.1f} %",
             "length": f"{each['mean_length']:.1f} of {each['max_length']}",
-            "changes": ", ".join(f"{place}: {value}" for place, value in told_changes(each)),
+            "changes": ", ".join(f"{place}: {value}" for place, value in changes_in_lines(each)),
         }
     return rows
 

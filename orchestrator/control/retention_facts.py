@@ -13,7 +13,7 @@ from orchestrator.control.peers import Peers
 from orchestrator.domain.retention import Decision, References, RetentionReference, RunFacts
 from orchestrator.persistence.keyset import Cursor
 from shared_store.volume import contents, trash
-from shared_store.volume.files import is_there
+from shared_store.volume.files import path_exists
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.references import references
 
@@ -114,7 +114,7 @@ class StoredRuns:
             archived = contents.archived(run)
             writer = self._peers.writer(run)
         except FileNotFoundError as error:
-            return RunFacts(run.name, damage=str(error)) if is_there(run.path) else None
+            return RunFacts(run.name, damage=str(error)) if path_exists(run.path) else None
         except (OSError, ValueError) as error:  # which may be one of this run alone: the volume is checked afterwards
             return RunFacts(run.name, damage=str(error))
         by = None if archived is None else f"by {archived.get('by', 'an unknown key')}"

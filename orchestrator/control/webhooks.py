@@ -183,7 +183,7 @@ def _words(problem: Any) -> str:
     """The problem of a value, without the value where that is a secret, or a URL that may hold one."""
     if problem["type"] == "value_error":
         return str(problem["ctx"]["error"])
-    return "expected a text" if problem["type"] == "string_type" else explain(problem)
+    return "expected a string" if problem["type"] == "string_type" else explain(problem)
 
 
 def event_of(status: str) -> str:

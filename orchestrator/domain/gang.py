@@ -111,7 +111,7 @@ class NodeSpec:
         except (ValueError, RecursionError) as error:
             raise MalformedOptions(f"MUSTER_SPEC can't be read: {error}") from None
         if spec is not None and not isinstance(spec, dict):
-            raise MalformedOptions("MUSTER_SPEC is not a mapping")
+            raise MalformedOptions("MUSTER_SPEC is not an object")
         if ("\\u" in text or text.count("[") + text.count("{") > DEEPEST_SPEC) and (problem := not_storable(spec)):
             raise MalformedOptions(f"MUSTER_SPEC: {problem[1]}")
         return spec
@@ -182,7 +182,7 @@ def gang_needs(node_properties: Mapping[str, Any]) -> GangSpec:
         minimum = int(variables.get("MUSTER_MIN_NODES", count))
     except ValueError:
         raise ValueError(
-            f"MUSTER_MIN_NODES is {variables['MUSTER_MIN_NODES'][:20]!r}; expected a whole number of nodes"
+            f"MUSTER_MIN_NODES is {variables['MUSTER_MIN_NODES'][:20]!r}; expected an integer number of nodes"
         ) from None
     least = min(max(minimum, main + 1), count)  # never without the main node
     return GangSpec(main, whole, least, NativeOptions.read(variables))
@@ -194,7 +194,7 @@ def _node_spec(entry: Mapping[str, Any]) -> NodeSpec:
     environment = {entry["name"]: entry.get("value", "") for entry in container.get("environment") or []}
     ranks = environment.get("MUSTER_RANKS_PER_NODE", "1")
     if not re.fullmatch("[1-9][0-9]{0,5}", ranks):
-        raise MalformedOptions(f"MUSTER_RANKS_PER_NODE is {ranks[:20]!r}, not a whole number from 1 on")
+        raise MalformedOptions(f"MUSTER_RANKS_PER_NODE is {ranks[:20]!r}, not an integer from 1 on")
     return NodeSpec(
         command=tuple(container.get("command") or ()),
         environment=environment,

@@ -281,7 +281,7 @@ class Option:
         if self.values and value not in self.values:
             raise ValueError(f"tag muster:{self.name} is {value!r}; {nearest(value, self.values)}")
         if self.kind is int and not (value.removeprefix("-").isascii() and value.removeprefix("-").isdigit()):
-            raise ValueError(f"tag muster:{self.name} is {value!r}, not a whole number; it is {self.help}")
+            raise ValueError(f"tag muster:{self.name} is {value!r}, not an integer; it is {self.help}")
 
 
 @dataclass(frozen=True)

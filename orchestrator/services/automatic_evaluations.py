@@ -42,7 +42,7 @@ from orchestrator.spec.evaluations import (
 from orchestrator.spec.sections import Evaluation
 from shared_store.contract.plugins import PluginError
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
-from shared_store.volume.evaluations import evaluation_is_over, keep_for_evaluation, wanted_checkpoints
+from shared_store.volume.evaluations import keep_for_evaluation, pending_checkpoints, release_from_evaluation
 from shared_store.volume.layout import Run
 
 LOOK = 2.0
@@ -151,8 +151,8 @@ class AutomaticEvaluations:
             names = [row.run for row in rows]
         for name in names:
             run = self._controller.access.store.run(name)
-            for checkpoint in wanted_checkpoints(run):
-                evaluation_is_over(run, checkpoint)
+            for checkpoint in pending_checkpoints(run):
+                release_from_evaluation(run, checkpoint)
 
     def _close_ended(self) -> None:
         """Give up the claim on checkpoints whose evaluation has ended, well or not."""
@@ -163,7 +163,7 @@ class AutomaticEvaluations:
             self._on_store(f"run {name}", partial(self._close, name, checkpoint))
 
     def _close(self, name: str, checkpoint: str) -> None:
-        evaluation_is_over(self._controller.access.store.run(name), checkpoint)
+        release_from_evaluation(self._controller.access.store.run(name), checkpoint)
         with self._controller.writes.session() as session:
             row = session.get_one(AutomaticEvaluation, name)
             row.open = False
@@ -248,7 +248,7 @@ class AutomaticEvaluations:
             job = commit_submission(controller, call)
         except ClientError as error:
             # a queue that takes no jobs, say: the next checkpoint that is due is tried
-            evaluation_is_over(run, chosen.name)
+            release_from_evaluation(run, chosen.name)
             self._note(training, counted, f"checkpoint {chosen.name} was not evaluated: {error}")
             self._backoff.failed(
                 ("evaluations of", run.name), f"run {run.name}: checkpoints are not evaluated: {error}"

@@ -266,7 +266,7 @@ def _content(path: str, how: KeptFile) -> Any:
             where = f":{error.lineno}" if isinstance(error, json.JSONDecodeError) else ""
             raise SpecError(f"{path}{where}: it is not JSON ({getattr(error, 'msg', 'nested too deeply')})") from None
         if isinstance(value, str):
-            raise SpecError(f"{path}: expected a list or a mapping, found a text")
+            raise SpecError(f"{path}: expected a list or an object, found a string")
     _check_size(path, value, how)
     return value
 

@@ -304,7 +304,7 @@ def validate(
         SpecError: One line naming the file, line and key, what was expected, and the nearest valid name.
     """
     if not isinstance(value, dict):
-        raise SpecError(f"{source}: expected a mapping of keys such as name, nodes, train; found {kind_of(value)}")
+        raise SpecError(f"{source}: expected an object of keys such as name, nodes, train; found {kind_of(value)}")
     if problem := not_storable(value):
         path, words = problem
         raise SpecError(f"{place_of(path, source, lines)}{words}")

@@ -35,7 +35,7 @@ class NodeRange(Section):
             return value
         if isinstance(value, int) and not isinstance(value, bool):
             return {"min": value, "max": value}
-        raise ValueError("expected a whole number of nodes, or {min: 2, max: 4}")
+        raise ValueError("expected an integer number of nodes, or {min: 2, max: 4}")
 
     @model_validator(mode="after")
     def _ordered(self) -> NodeRange:

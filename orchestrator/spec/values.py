@@ -88,7 +88,7 @@ def _secrets(value: dict[str, str]) -> dict[str, str]:
 
 def _argument(value: str) -> str:
     if "\0" in value:
-        raise ValueError("expected a text without a zero byte")
+        raise ValueError("expected a string without a zero byte")
     return value
 
 

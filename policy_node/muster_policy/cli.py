@@ -134,7 +134,7 @@ def _complete(settings: Settings, bundle: Bundle) -> None:
     settings.joints = read_joints(settings.joints_file, bundle.contract.joints) if settings.joints_file else {}
     text = os.environ.get("ROS_DOMAIN_ID", "") or "0"
     if settings.domain is None and not text.isdigit():
-        raise Refused(f"ROS_DOMAIN_ID={text}: expected a whole number")
+        raise Refused(f"ROS_DOMAIN_ID={text}: expected an integer")
     settings.domain = int(text) if settings.domain is None else settings.domain
     if not 0 <= settings.domain <= 232:
         raise Refused(f"domain {settings.domain}: expected 0 to 232")
@@ -219,7 +219,7 @@ def _whole(text: str) -> int:
     try:
         return int(text)
     except ValueError:
-        raise argparse.ArgumentTypeError(f"expected a whole number, found {text}") from None
+        raise argparse.ArgumentTypeError(f"expected an integer, found {text}") from None
 
 
 def _say(line: str) -> None:

@@ -122,7 +122,7 @@ def action_space(content: Any) -> ActionSpace:
     if isinstance(content, Sequence) and not isinstance(content, str):
         content = {"action_space": content}
     if not isinstance(content, Mapping):
-        raise Refused((), f"expected a mapping with action_space and action_space_type, found {shown(content)}")
+        raise Refused((), f"expected an object with action_space and action_space_type, found {shown(content)}")
     lidar, cameras = _sensors(content.get("sensor", [CAMERA]))
     if "action_space" not in content:
         raise Refused((), f"action_space is missing; {nearest('action_space', list(map(str, content)))}")
@@ -226,7 +226,7 @@ def _range(name: str, ends: Any, limits: tuple[float, float], unit: str, notes: 
 def _check_keys(where: tuple[str | int, ...], value: Any, keys: Sequence[str]) -> None:
     """Refuse what is no mapping with these keys; others beside them, such as ``index``, are not looked at."""
     if not isinstance(value, Mapping):
-        raise Refused(where, f"expected a mapping of {', '.join(keys)}, found {shown(value)}")
+        raise Refused(where, f"expected an object of {', '.join(keys)}, found {shown(value)}")
     missing = [key for key in keys if key not in value]
     for key in value if missing else ():
         if key not in (*keys, "index"):

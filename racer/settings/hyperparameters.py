@@ -71,7 +71,7 @@ def plain_settings(train: Mapping[str, Any], config: Any) -> tuple[dict[str, Any
     """
     where, values = "hyperparameters", train["hyperparameters"]
     if not isinstance(values, Mapping):
-        raise Refused((where,), f"expected a mapping such as {{lr: 3.0e-4}}, or a JSON file, found {shown(values)}")
+        raise Refused((where,), f"expected an object such as {{lr: 3.0e-4}}, or a JSON file, found {shown(values)}")
     algorithm = train.get("algorithm", "ppo")
     if algorithm not in ("ppo", "sac"):
         raise Refused((where,), f"they are settings of ppo and sac, and the algorithm is {shown(algorithm)}")

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import time
 import uuid
 from collections.abc import Mapping
@@ -28,7 +27,7 @@ from shared_store.contract.error_text import counted, nearest, shown
 from shared_store.volume import bundles
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_json
-from shared_store.volume.layout import NAME, Store, names_in
+from shared_store.volume.layout import Store, check_name, names_in
 
 CAR: Mapping[str, Any] = {
     "control_hz": 15.0,
@@ -332,26 +331,20 @@ def find(store: Store, name: str) -> StoredLeague:
 
 def create(store: Store, league: League) -> StoredLeague:
     """Create a league, permanently. Raises LeagueError for an invalid name or an existing league; OSError."""
-    if not NAME.fullmatch(league.name):
-        raise LeagueError(
-            f"league name {league.name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a "
-            "letter or digit"
-        )
+    check_name("league", league.name, LeagueError)
     taken = LeagueError(f"league {league.name} exists already, and a league is never changed; choose another name")
     if league.name in names(store):
         raise taken
-    folder_in(store).mkdir(parents=True, exist_ok=True)
     path = folder_in(store) / league.name
     hidden = folder_in(store) / f".{uuid.uuid4().hex}.tmp"
     try:
-        for folder in ("definition", "entries", "disqualified"):
-            (hidden / folder).mkdir(parents=True)
-        _fill(hidden / "definition", "league.json", asdict(league))
-        bundles.publish(hidden, path)
+        with bundles.hidden_folder(hidden):
+            for folder in ("definition", "entries", "disqualified"):
+                (hidden / folder).mkdir()
+            _fill(hidden / "definition", "league.json", asdict(league))
+            bundles.publish(hidden, path)
     except FileExistsError:  # another process was faster
         raise taken from None
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
     return StoredLeague(store, path)
 
 
@@ -392,13 +385,9 @@ def moment(seconds: float) -> str:
 
 def _seal(path: Path, name: str, document: Mapping[str, Any]) -> None:
     """A new sealed directory with one document. Raises FileExistsError, OSError."""
-    hidden = path.parent / f".{uuid.uuid4().hex}.tmp"
-    try:
-        hidden.mkdir()
+    with bundles.hidden_folder(path.parent / f".{uuid.uuid4().hex}.tmp") as hidden:
         _fill(hidden, name, document)
         bundles.publish(hidden, path)
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def _fill(folder: Path, name: str, document: Mapping[str, Any]) -> None:

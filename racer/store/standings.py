@@ -79,7 +79,7 @@ def read_race(race: Any) -> RaceResults:
         for key in counts:
             value = trial.get(key)
             if not isinstance(value, int) or isinstance(value, bool) or value < 0:
-                raise BadRace(f"{where}.{key}: expected a whole number, found {shown(value)}")
+                raise BadRace(f"{where}.{key}: expected an integer, found {shown(value)}")
             counts[key] += value
         if trial["status"] == LAP_COMPLETE:
             times.append(_lap_time(trial.get("time"), f"{where}.time"))

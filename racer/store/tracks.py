@@ -7,7 +7,6 @@ file's digest, the track's measures and its origin. It appears by a rename that 
 from __future__ import annotations
 
 import re
-import shutil
 import time
 import uuid
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,7 @@ from shared_store.contract.error_text import nearest
 from shared_store.volume import bundles
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.files import DamagedFile, open_regular, refuse_links
-from shared_store.volume.layout import NAME, Store, names_in
+from shared_store.volume.layout import Store, check_name, names_in
 
 FILE = "track.npy"
 LARGEST = 1 << 20
@@ -113,26 +112,19 @@ def add(store: Store, name: str, data: bytes, facts: Mapping[str, Any]) -> Store
         TrackError: The name is invalid, or a track of that name exists.
         OSError: The volume is full or gone.
     """
-    if not NAME.fullmatch(name):
-        raise TrackError(
-            f"track name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
-        )
+    check_name("track", name, TrackError)
     track = StoredTrack(folder_in(store) / name)
     if name in names(store):
         raise _taken(track)
-    folder_in(store).mkdir(parents=True, exist_ok=True)
-    hidden = folder_in(store) / f".{uuid.uuid4().hex}.tmp"
     try:
-        hidden.mkdir()
-        (hidden / FILE).write_bytes(data)
-        bundles.seal(hidden, {"track": {**facts, "name": name, "created": time.time()}})
-        for file in hidden.iterdir():
-            file.chmod(0o444)
-        bundles.publish(hidden, track.path)
+        with bundles.hidden_folder(folder_in(store) / f".{uuid.uuid4().hex}.tmp") as hidden:
+            (hidden / FILE).write_bytes(data)
+            bundles.seal(hidden, {"track": {**facts, "name": name, "created": time.time()}})
+            for file in hidden.iterdir():
+                file.chmod(0o444)
+            bundles.publish(hidden, track.path)
     except FileExistsError:  # another was faster
         raise _taken(track) from None
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
     return track
 
 

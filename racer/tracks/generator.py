@@ -59,7 +59,7 @@ def make_random(
     """
     check_measures(length, width, spacing, direction)
     if not 0 <= seed <= LARGEST_SEED:
-        raise BadTrack(f"seed {seed}: expected a whole number from 0 to {LARGEST_SEED}")
+        raise BadTrack(f"seed {seed}: expected an integer from 0 to {LARGEST_SEED}")
     if not 0 <= roughness <= 1:
         raise BadTrack(f"roughness {roughness:g}: expected 0 to 1")
     check_room("a random track", least_radius, length, width)

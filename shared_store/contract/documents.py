@@ -39,34 +39,36 @@ def parse(kind: Any, value: Any, where: str) -> Any:
             return None
         return value if isinstance(value, str) and str in arguments else parse(arguments[0], value, where)
     if origin is tuple:
-        lengths = (len(value),) if isinstance(value, list) and arguments[-1] is Ellipsis else (len(arguments),)
-        if not isinstance(value, list) or len(value) not in lengths:
-            raise DocumentError(f"{where}: expected a list of {lengths[0]}, found {shown(value)}")
-        kinds = arguments if arguments[-1] is not Ellipsis else (arguments[0],) * len(value)
-        return tuple(parse(each, item, f"{where}.{i}") for i, (each, item) in enumerate(zip(kinds, value, strict=True)))
+        if arguments[-1] is Ellipsis and isinstance(value, list):
+            arguments = (arguments[0],) * len(value)
+        if not isinstance(value, list) or len(value) != len(arguments):
+            raise DocumentError(f"{where}: expected a list of {len(arguments)}, found {shown(value)}")
+        return tuple(
+            parse(each, item, f"{where}.{i}") for i, (each, item) in enumerate(zip(arguments, value, strict=True))
+        )
     if origin is not None and issubclass(origin, Mapping):
         if not isinstance(value, Mapping):
-            raise DocumentError(f"{where}: expected a mapping, found {kind_of(value)}")
+            raise DocumentError(f"{where}: expected an object, found {kind_of(value)}")
         return {str(name): parse(arguments[1], each, f"{where}.{name}") for name, each in value.items()}
     allowed = (int, float) if kind is float else kind
     if not isinstance(value, allowed) or (isinstance(value, bool) and kind is not bool):
-        names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+        names = {float: "a number", int: "an integer", str: "a string", bool: "true or false"}
         raise DocumentError(f"{where}: expected {names[kind]}, found {shown(value)}")
     return float(value) if kind is float else value
 
 
 def _parse_fields(kind: Any, value: Any, where: str) -> Any:
     if not isinstance(value, Mapping):
-        raise DocumentError(f"{where}: expected a mapping, found {kind_of(value)}")
+        raise DocumentError(f"{where}: expected an object, found {kind_of(value)}")
     hints = get_type_hints(kind)
     fields = {field.name: field for field in dataclasses.fields(kind)}
     for name in value:
         if name not in fields:
             raise DocumentError(f"{where}: unknown key {shown(name)}; {nearest(name, fields)}")
-    given = {}
+    values = {}
     for name, field in fields.items():
         if name in value:
-            given[name] = parse(hints[name], value[name], f"{where}.{name}" if ": " in where else f"{where}: {name}")
+            values[name] = parse(hints[name], value[name], f"{where}.{name}" if ": " in where else f"{where}: {name}")
         elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
             raise DocumentError(f"{where}: {name} is missing")
-    return kind(**given)
+    return kind(**values)

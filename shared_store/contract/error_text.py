@@ -8,25 +8,10 @@ import reprlib
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-_EXPECTED = {
-    "missing": "is required",
-    "int_type": "expected a whole number",
-    "int_from_float": "expected a whole number",
-    "int_parsing": "expected a whole number",
-    "float_type": "expected a number",
-    "float_parsing": "expected a number",
-    "finite_number": "expected a finite number",
-    "string_type": "expected a text",
-    "list_type": "expected a list",
-    "tuple_type": "expected a list",
-    "dict_type": "expected a mapping",
-    "mapping_type": "expected a mapping",
-    "bool_type": "expected true or false",
-    "bool_parsing": "expected true or false",
-    "model_type": "expected a mapping",
-    "dataclass_type": "expected a mapping",
-    "dataclass_exact_type": "expected a mapping",
-}
+_NAMES = {"int": "an integer", "float": "a number", "string": "a string", "bool": "true or false"}
+_NAMES |= dict.fromkeys(("list", "tuple"), "a list")
+_NAMES |= dict.fromkeys(("dict", "mapping", "model", "dataclass"), "an object")
+"""The first words of pydantic's types of errors, and what they expect."""
 
 OF_PLUGIN = "if a plug-in provides it, install the plug-in's package"
 """What to do where a name is unknown that a plug-in may bring: a task, a command, a section of a job."""
@@ -76,13 +61,15 @@ def explain(problem: Mapping[str, Any]) -> str:
         return f"expected {problem['ctx']['expected']}, found {shown(found)}"
     if kind == "float_type" and (power := re.fullmatch(r"([+-]?\d+)(?:\.(\d*))?[eE]([+-]?)(\d+)", str(found))):
         written = f"{power[1]}.{power[2] or 0}e{power[3] or '+'}{power[4]}"  # a form that YAML 1.1 reads as a number
-        return f"expected a number, found a text ({shown(found)}); in YAML it is written {written}"
+        return f"expected a number, found a string ({shown(found)}); in YAML it is written {written}"
     if kind == "too_short" and problem["ctx"]["min_length"] == 1:
         # tuples are settings such as the widths of layers
         what = "number" if problem["ctx"]["field_type"] == "Tuple" else "item"
         return f"expected at least one {what}, found {shown(list(found) if isinstance(found, tuple) else found)}"
-    if kind in _EXPECTED:
-        return f"{_EXPECTED[kind]}, found {kind_of(found)}"
+    if kind == "finite_number":
+        return f"expected a finite number, found {kind_of(found)}"
+    if kind.endswith(("_type", "_parsing", "_from_float")) and (name := _NAMES.get(kind.partition("_")[0])):
+        return f"expected {name}, found {kind_of(found)}"
     message = str(problem["msg"])
     return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
 
@@ -106,16 +93,9 @@ def unknown_task(name: str, known: Iterable[str]) -> str:
 
 def kind_of(value: object) -> str:
     """The common word for the type of a value of a YAML document."""
-    names = {
-        dict: "a mapping",
-        list: "a list",
-        str: "a text",
-        bool: "true or false",
-        int: "a whole number",
-        float: "a number",
-    }
+    name = type(value).__name__
     what = f" ({shown(value)})" if isinstance(value, str | int | float) else ""
-    return "nothing" if value is None else names.get(type(value), type(value).__name__) + what
+    return "nothing" if value is None else _NAMES.get("string" if name == "str" else name, name) + what
 
 
 def shown(value: object, most: int = 60) -> str:

@@ -11,6 +11,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from shared_store.contract.documents import parse
+
 _LONGEST_NAME, _LONGEST_FILE, _LONGEST_CAUSE = 128, 512, 256
 """Characters that are kept: of a type's name and of a file's path the last ones, of a cause the first ones."""
 _CHAINED = re.compile(
@@ -21,21 +23,13 @@ _CHAINED = re.compile(
 _START = "Traceback (most recent call last):"
 _FRAME = re.compile(r'  File "(.+)", line ([0-9]{1,9})(?:, in .+)?')
 _EXCEPTION = re.compile(r"([A-Za-z_][\w.]*)(?:: (.*))?")
-_OUTSIDE = (
-    "GangError",
-    "StaleEpoch",
-    "DamagedCheckpoint",
-    "DamagedFile",
-    "StoreError",
-    "KeyboardInterrupt",
-    "SystemExit",
-)
-"""Names of types, without their modules, of what ends a rank from outside."""
-_OUTSIDE_TYPES = (OSError, MemoryError, EOFError)
+_OUTSIDE_TYPES = (OSError, MemoryError, EOFError, KeyboardInterrupt, SystemExit)
 _OUTSIDE_NAMES = re.compile(
+    r"^(?:GangError|StaleEpoch|StoreError|DamagedCheckpoint|DamagedFile)$|"
     r"Memory|Connect|Timeout|TimedOut|Network|Socket|HTTP|SSL|URL|Unavailable|Retry|gaierror|Dist[A-Z]\w*Error|DistError|Accelerator|"
     r"Subprocess|CalledProcess|BrokenProcess|BrokenExecutor"
 )
+"""In names of types, without their modules, of what ends a rank from outside."""
 _OUTSIDE_WORDS = re.compile(
     r"out of memory|failed to allocate|can't allocate memory|cannot allocate memory|CUDA (?:error|driver)|cuDNN|cuBLAS|NCCL|gloo|by peer|"
     r"connection (?:closed|reset|refused|aborted)|timed out|broken pipe|no space left|input/output error|stale file handle|"
@@ -58,6 +52,14 @@ class Fault:
     """Distinguishes exceptions that one line raises for unlike reasons, such as the reward term that is not finite. Without numbers
     that differ between attempts; empty as a rule."""
 
+    def __post_init__(self) -> None:
+        """Bounds the texts. Raises ValueError for a line that no file has."""
+        if not 0 <= self.line < 2**31:
+            raise ValueError("fault: line is out of range")
+        object.__setattr__(self, "type", self.type[-_LONGEST_NAME:])
+        object.__setattr__(self, "file", self.file[-_LONGEST_FILE:])
+        object.__setattr__(self, "cause", self.cause[:_LONGEST_CAUSE])
+
     def __str__(self) -> str:
         return f"{self.type} in {self.file}, line {self.line}" + (f" ({self.cause})" if self.cause else "")
 
@@ -70,42 +72,25 @@ def fault_in(text: str, directory: Path | None = None, cause: str = "") -> Fault
         directory: The rank's working directory; None: that of this process.
         cause: :attr:`Fault.cause`, which no traceback shows.
     """
-    fault, above = None, f"{directory or _here()}/"
+    try:
+        above = f"{directory or os.getcwd()}/"
+    except OSError:  # this process's directory is deleted
+        above = "/"
+    fault = None
     for part in reversed(_CHAINED.split(text)):
         if (found := _last(part)) is None:
             return None
         name, message, file, line = found
         if _is_from_outside(name, message, file):
             return None
-        fault = fault or _bounded(Fault(name, file.removeprefix(above), line, cause))
+        fault = fault or Fault(name, file.removeprefix(above), line, cause)
     return fault
 
 
 def fault_from(value: object) -> Fault | None:
-    """The fault of its ``asdict`` form, which a job can write itself, with bounded texts; None for None. Raises TypeError if it is damaged."""
-    if value is None:
-        return None
-    if not isinstance(value, dict):
-        raise TypeError("a fault is a mapping")
-    fault = Fault(**value)
-    texts = (fault.type, fault.file, fault.cause)
-    if not all(isinstance(text, str) for text in texts) or type(fault.line) is not int:
-        raise TypeError("a field of a fault is of the wrong type")
-    if not 0 <= fault.line < 2**31:
-        raise TypeError("a fault is in a line that no file has")
-    return _bounded(fault)
-
-
-def _bounded(fault: Fault) -> Fault:
-    return Fault(fault.type[-_LONGEST_NAME:], fault.file[-_LONGEST_FILE:], fault.line, fault.cause[:_LONGEST_CAUSE])
-
-
-def _here() -> str:
-    """This process's working directory; empty where it is deleted."""
-    try:
-        return os.getcwd()
-    except OSError:
-        return ""
+    """The fault of its ``asdict`` form, which a job can write itself; None for None. Raises ValueError if it is damaged."""
+    fault: Fault | None = parse(Fault | None, value, "fault")
+    return fault
 
 
 def _last(text: str) -> tuple[str, str, str, int] | None:
@@ -121,12 +106,10 @@ def _last(text: str) -> tuple[str, str, str, int] | None:
 
 
 def _is_from_outside(name: str, message: str, file: str) -> bool:
-    short = name.rpartition(".")[2]
     known = getattr(builtins, name, None)
     return (
-        short in _OUTSIDE
-        or (isinstance(known, type) and issubclass(known, _OUTSIDE_TYPES))
-        or _OUTSIDE_NAMES.search(short) is not None
+        (isinstance(known, type) and issubclass(known, _OUTSIDE_TYPES))
+        or _OUTSIDE_NAMES.search(name.rpartition(".")[2]) is not None
         or _OUTSIDE_WORDS.search(message) is not None
         or _COLLECTIVES in file
     )

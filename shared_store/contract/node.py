@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, field, fields
+from typing import Any
 
 LOG_LIMIT = 1 << 30
 """Bytes of a node's log in one attempt to keep, by default."""
@@ -49,57 +50,62 @@ class ContractError(Exception):
     """A variable of the node contract is missing or malformed; the message names it."""
 
 
+def _of(variable: str) -> dict[str, str]:
+    """The metadata of a field that stands in a variable as it is."""
+    return {"variable": variable}
+
+
 @dataclass(frozen=True)
 class NodeContract:
     """The settings with which a node of a gang starts."""
 
-    job: str
+    job: str = field(metadata=_of("MUSTER_JOB_ID"))
     """Job id, without ``#``."""
-    attempt: int
+    attempt: int = field(metadata=_of("AWS_BATCH_JOB_ATTEMPT"))
     """From 1; grows with every launch of the job."""
     node_index: int
     node_count: int
     main_index: int
     """AWS's node indices; ``node_index == main_index`` on the main node."""
-    master_address: str
-    master_port: int
-    run: str
-    store: str
-    epoch: int
+    master_address: str = field(metadata=_of("MASTER_ADDR"))
+    master_port: int = field(metadata=_of("MASTER_PORT"))
+    run: str = field(metadata=_of("MUSTER_RUN"))
+    store: str = field(metadata=_of("MUSTER_STORE"))
+    epoch: int = field(metadata=_of("MUSTER_EPOCH"))
     """Fencing number of this attempt in the run."""
-    job_epoch: int
+    job_epoch: int = field(metadata=_of("MUSTER_JOB_EPOCH"))
     """Epoch of the job's first attempt."""
-    ranks_per_node: int = 1
-    grace: float = 30.0
+    ranks_per_node: int = field(default=1, metadata=_of("MUSTER_RANKS_PER_NODE"))
+    grace: float = field(default=30.0, metadata=_of("MUSTER_GRACE_SECONDS"))
     """Seconds between SIGTERM and SIGKILL."""
-    queue: str = "default"
-    compute_environment: str = "local"
-    cpus: float = 1.0
+    queue: str = field(default="default", metadata=_of("AWS_BATCH_JQ_NAME"))
+    compute_environment: str = field(default="local", metadata=_of("AWS_BATCH_CE_NAME"))
+    cpus: float = field(default=1.0, metadata=_of("MUSTER_CPUS"))
     """The node's share of CPUs, divided among its ranks."""
-    stall_timeout: float | None = None
+    stall_timeout: float | None = field(default=None, metadata=_of("MUSTER_STALL_TIMEOUT"))
     """Seconds without an iteration after which a rank counts as stuck; None: never."""
-    log_limit: int = LOG_LIMIT
+    log_limit: int = field(default=LOG_LIMIT, metadata=_of("MUSTER_LOG_LIMIT"))
     """Bytes of the node's log to keep."""
     is_gang: bool = True
     """False for a single-node job: AWS gives it no node variables."""
     array: tuple[int, int] | None = None
     """Index and size, of an array's child."""
-    isolation: str = ""
+    isolation: str = field(default="", metadata=_of("MUSTER_ISOLATION"))
     """``image``: a plain process starts as in a container: in an empty directory, with few of the machine's variables and a
     standard PATH. ``muster``: the same with Muster's own environment on PATH, as in Muster's own image. Empty: neither."""
-    user: str | None = None
+    user: str | None = field(default=None, metadata=_of("MUSTER_USER"))
     """``UID:GID`` of the program, if it differs from the supervisor's."""
-    memory_group: str = ""
+    memory_group: str = field(default="", metadata=_of("MUSTER_MEMORY_GROUP"))
     """Directory of the control group that limits the memory of the job's processes to ``memory_limit``; empty for no limit."""
-    memory_limit: int = 0
+    memory_limit: int = field(default=0, metadata=_of("MUSTER_MEMORY_LIMIT"))
     """MiB."""
-    note: str = ""
+    note: str = field(default="", metadata=_of("MUSTER_NOTE"))
     """A line for the beginning of the node's log; empty for none."""
-    address: str | None = None
+    address: str | None = field(default=None, metadata=_of("MUSTER_ADDRESS"))
     """The node's own address, if the engine sets one."""
-    bus: str | None = None
+    bus: str | None = field(default=None, metadata=_of("MUSTER_BUS"))
     """Endpoint of the controller's bus router."""
-    bus_token: str | None = None
+    bus_token: str | None = field(default=None, metadata=_of("MUSTER_BUS_TOKEN"))
     """The attempt's :class:`~shared_store.contract.bus.Credential`, as text."""
 
     @property
@@ -119,41 +125,19 @@ class NodeContract:
         return f"{self.job}/{self.attempt}/{self.epoch}"
 
     def to_env(self) -> dict[str, str]:
-        """The variables, as an engine sets them on this node."""
-        env = {
+        """The variables, as an engine sets them on this node; one that is empty by default is left out where it is empty."""
+        return {
             **self._batch_env(),
-            "AWS_BATCH_JOB_ATTEMPT": str(self.attempt),
-            "AWS_BATCH_CE_NAME": self.compute_environment,
-            "AWS_BATCH_JQ_NAME": self.queue,
             "AWS_EXECUTION_ENV": "MUSTER",
-            "MASTER_ADDR": self.master_address,
-            "MASTER_PORT": str(self.master_port),
             "NODE_RANK": str(self.node_rank),
             "NNODES": str(self.node_count),
-            "MUSTER_JOB_ID": self.job,
-            "MUSTER_RUN": self.run,
-            "MUSTER_STORE": self.store,
-            "MUSTER_EPOCH": str(self.epoch),
-            "MUSTER_JOB_EPOCH": str(self.job_epoch),
             "MUSTER_GANG": self.gang,
-            "MUSTER_RANKS_PER_NODE": str(self.ranks_per_node),
-            "MUSTER_GRACE_SECONDS": f"{self.grace:g}",
-            "MUSTER_CPUS": f"{self.cpus:g}",
-            "MUSTER_LOG_LIMIT": str(self.log_limit),
+            **{
+                variable: f"{value:g}" if isinstance(value, float) else str(value)
+                for variable, each in _VARIABLES.items()
+                if (value := getattr(self, each.name)) or each.default not in (None, "", 0)
+            },
         }
-        stall = None if self.stall_timeout is None else f"{self.stall_timeout:g}"
-        optional = {
-            "MUSTER_STALL_TIMEOUT": stall,
-            "MUSTER_ISOLATION": self.isolation,
-            "MUSTER_USER": self.user,
-            "MUSTER_MEMORY_GROUP": self.memory_group,
-            "MUSTER_MEMORY_LIMIT": str(self.memory_limit or ""),
-            "MUSTER_NOTE": self.note,
-            "MUSTER_ADDRESS": self.address,
-            "MUSTER_BUS": self.bus,
-            "MUSTER_BUS_TOKEN": self.bus_token,
-        }
-        return env | {name: value for name, value in optional.items() if value}
 
     def _batch_env(self) -> dict[str, str]:
         """The variables that depend on the kind of job; only the other nodes get the main node's address."""
@@ -176,54 +160,35 @@ class NodeContract:
     def from_env(cls, env: Mapping[str, str]) -> NodeContract:
         """Read the contract. Raises ContractError naming the variable that is missing or malformed."""
 
-        def integer(name: str, default: int | None = None) -> int:
-            value = env.get(name, "" if default is None else str(default))
-            if not re.fullmatch(r"-?[0-9]+", value):
-                problem = f"is {value!r}, not a whole number" if value else "is missing"
-                raise ContractError(f"{name} {problem}; a node is started by one of Muster's engines")
-            return int(value)
-
-        def number(name: str, default: float) -> float:
-            value = env.get(name, str(default))
-            if not re.fullmatch(r"[0-9]+(\.[0-9]*)?(e[+-]?[0-9]+)?", value):
-                raise ContractError(f"{name} is {value!r}, not a number; a node is started by one of Muster's engines")
-            return float(value)
-
-        def text(name: str) -> str:
-            if not env.get(name):
-                raise ContractError(f"{name} is missing; a node is started by one of Muster's engines")
-            return env[name]
-
-        index, main = integer("AWS_BATCH_JOB_NODE_INDEX", 0), integer("AWS_BATCH_JOB_MAIN_NODE_INDEX", 0)
-        epoch = integer("MUSTER_EPOCH")
-        array = (integer("AWS_BATCH_JOB_ARRAY_INDEX", 0), integer("AWS_BATCH_JOB_ARRAY_SIZE", 0))
+        env = {**_WHERE_ABSENT, "MUSTER_JOB_EPOCH": env.get("MUSTER_EPOCH", ""), **env}
+        values = {each.name: _read(env, variable, each.type, each.default) for variable, each in _VARIABLES.items()}
+        array = tuple(_read(env, f"AWS_BATCH_JOB_ARRAY_{each}", "int", 0) for each in ("INDEX", "SIZE"))
         return cls(
-            job=text("MUSTER_JOB_ID"),
-            attempt=integer("AWS_BATCH_JOB_ATTEMPT", 1),
-            node_index=index,
-            node_count=integer("AWS_BATCH_JOB_NUM_NODES", 1),
-            main_index=main,
-            master_address=env.get("MASTER_ADDR", "127.0.0.1"),
-            master_port=integer("MASTER_PORT", 29500),
-            run=text("MUSTER_RUN"),
-            store=text("MUSTER_STORE"),
-            epoch=epoch,
-            job_epoch=integer("MUSTER_JOB_EPOCH", epoch),
-            ranks_per_node=integer("MUSTER_RANKS_PER_NODE", 1),
-            grace=number("MUSTER_GRACE_SECONDS", 30.0),
-            queue=env.get("AWS_BATCH_JQ_NAME", "default"),
-            compute_environment=env.get("AWS_BATCH_CE_NAME", "local"),
-            cpus=number("MUSTER_CPUS", 1.0),
-            stall_timeout=float(env["MUSTER_STALL_TIMEOUT"]) if env.get("MUSTER_STALL_TIMEOUT") else None,
-            log_limit=integer("MUSTER_LOG_LIMIT", LOG_LIMIT),
+            **values,
+            node_index=_read(env, "AWS_BATCH_JOB_NODE_INDEX", "int", 0),
+            node_count=_read(env, "AWS_BATCH_JOB_NUM_NODES", "int", 1),
+            main_index=_read(env, "AWS_BATCH_JOB_MAIN_NODE_INDEX", "int", 0),
             is_gang="AWS_BATCH_JOB_NODE_INDEX" in env,
             array=array if "AWS_BATCH_JOB_ARRAY_INDEX" in env else None,
-            isolation=env.get("MUSTER_ISOLATION", ""),
-            user=env.get("MUSTER_USER"),
-            memory_group=env.get("MUSTER_MEMORY_GROUP", ""),
-            memory_limit=integer("MUSTER_MEMORY_LIMIT", 0),
-            note=env.get("MUSTER_NOTE", ""),
-            address=env.get("MUSTER_ADDRESS"),
-            bus=env.get("MUSTER_BUS"),
-            bus_token=env.get("MUSTER_BUS_TOKEN"),
         )
+
+
+_VARIABLES = {each.metadata["variable"]: each for each in fields(NodeContract) if each.metadata}
+_WHERE_ABSENT = {"AWS_BATCH_JOB_ATTEMPT": "1", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": "29500"}
+"""Values of variables that a node outside of a gang need not have."""
+_FORMS = {
+    "int": (re.compile(r"-?[0-9]+"), int, "an integer"),
+    "float": (re.compile(r"[0-9]+(\.[0-9]*)?(e[+-]?[0-9]+)?"), float, "a number"),
+}
+
+
+def _read(env: Mapping[str, str], variable: str, kind: Any, default: Any) -> Any:
+    """The value of a variable as a field of type ``kind``. Raises ContractError."""
+    value = env.get(variable)
+    if default is not MISSING and (value is None or (not value and kind == "float | None")):
+        return default
+    form, convert, words = _FORMS.get(kind.partition(" ")[0], (None, str, "a string"))
+    if form.fullmatch(value or "") if form else value or default is not MISSING:
+        return convert(value)
+    problem = f"is {value!r}, not {words}" if value or kind == "float" else "is missing"
+    raise ContractError(f"{variable} {problem}; a node is started by one of Muster's engines")

@@ -11,14 +11,14 @@ import re
 import sys
 from collections.abc import Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, is_dataclass
-from functools import cache
+from dataclasses import dataclass
+from functools import cache, reduce
 from importlib import import_module
 
 TYPE_CHECKING = False  # the command reads this module for `muster --help`
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from typing import Any, Protocol
+    from typing import Any, ClassVar, Protocol
 
     class EvaluationRules(Protocol):
         """Rules by which a section of a job evaluates a checkpoint: in one episode a world, on one node."""
@@ -71,32 +71,43 @@ _OPERATION: _Form = (
 _FOLDER: _Form = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]*"), "the name of a folder, of letters, digits, '_' and '-'"
 
 
-def _check(where: str, value: object, form: _Form) -> None:
-    """Raises PluginError for anything but a text of this form."""
-    if not isinstance(value, str) or not form[0].fullmatch(value):
+def _check(where: str, value: object, *forms: _Form | type) -> None:
+    """Raises PluginError for anything but a text of the form, an object of the class, or, of several forms, a tuple of such texts."""
+    form = forms[0]
+    if len(forms) > 1:
+        if not isinstance(value, tuple) or len(value) != len(forms):
+            raise PluginError(f"{where}: expected tuples of {len(forms)} texts, found {value!r:.80}")
+        for text, each in zip(value, forms, strict=True):
+            _check(where, text, each)
+    elif isinstance(form, type):
+        if not isinstance(value, form):
+            raise PluginError(f"{where}: expected {form.__name__}(…), found {value!r:.80}")
+    elif not isinstance(value, str) or not form[0].fullmatch(value):
         raise PluginError(f"{where}: expected {form[1]}, found {value!r:.80}")
 
 
-def _check_each(where: str, values: object, *forms: _Form) -> None:
-    """Raises PluginError for anything but a tuple of texts, or of tuples with a text of each form."""
-    for value in _tuple(where, values):
-        if len(forms) == 1:
-            _check(where, value, forms[0])
-        elif not isinstance(value, tuple) or len(value) != len(forms):
-            raise PluginError(f"{where}: expected tuples of {len(forms)} texts, found {value!r:.80}")
-        else:
-            for text, form in zip(value, forms, strict=True):
-                _check(where, text, form)
+class _Declaration:
+    """Base of dataclasses whose fields have the forms of ``FORMS``, each of them where the default is a tuple."""
 
+    FORMS: ClassVar[Mapping[str, tuple[_Form | type, ...]]]
 
-def _tuple(where: str, values: object) -> tuple[object, ...]:
-    if not isinstance(values, tuple):
-        raise PluginError(f"{where}: expected a tuple, found {values!r:.80}")
-    return values
+    def __post_init__(self) -> None:
+        """Raises PluginError for a field of another form."""
+        owner = "" if isinstance(self, Plugin) else f"{type(self).__name__}."
+        for name, forms in self.FORMS.items():
+            value, default = getattr(self, name), getattr(type(self), name, None)
+            if default != ():
+                if value != "" or default != "":
+                    _check(f"{owner}{name}", value, *forms)
+                continue
+            if not isinstance(value, tuple):
+                raise PluginError(f"{owner}{name}: expected a tuple, found {value!r:.80}")
+            for each in value:
+                _check(f"{owner}{name}", each, *forms)
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(_Declaration):
     """A command, or a group of commands, in ``muster --help``.
 
     Attributes:
@@ -106,19 +117,16 @@ class Command:
         summary: The first line of the command's own help.
     """
 
+    FORMS = {"name": (_NAME,), "module": (_MODULE,), "panel": (_TEXT,), "summary": (_TEXT,)}
+
     name: str
     module: str
     panel: str
     summary: str
 
-    def __post_init__(self) -> None:
-        """Raises PluginError for a field of another form."""
-        for field, form in (("name", _NAME), ("module", _MODULE), ("panel", _TEXT), ("summary", _TEXT)):
-            _check(f"Command.{field}", getattr(self, field), form)
-
 
 @dataclass(frozen=True)
-class JobSection:
+class JobSection(_Declaration):
     """A kind of job, by the key of its section in the job YAML, which evaluates a checkpoint of a run.
 
     Attributes:
@@ -130,6 +138,11 @@ class JobSection:
         watcher: ``module:Class``: a :class:`worker.evaluation.evaluation.Watcher` in the rank.
     """
 
+    FORMS = {
+        **{"key": (_KEY,), "verb": (_TEXT,), "rank": (_MODULE,)},
+        **dict.fromkeys(("model", "rules", "watcher"), (_PLACE,)),
+    }
+
     key: str
     verb: str
     model: str
@@ -137,17 +150,9 @@ class JobSection:
     rules: str
     watcher: str
 
-    def __post_init__(self) -> None:
-        """Raises PluginError for a field of another form."""
-        _check("JobSection.key", self.key, _KEY)
-        _check("JobSection.verb", self.verb, _TEXT)
-        _check("JobSection.rank", self.rank, _MODULE)
-        for field in ("model", "rules", "watcher"):
-            _check(f"JobSection.{field}", getattr(self, field), _PLACE)
-
 
 @dataclass(frozen=True)
-class Plugin:
+class Plugin(_Declaration):
     """What a package adds. Tasks and algorithms are entry points of ``muster.tasks`` and ``muster.algorithms`` in the same package.
 
     A field of another form raises PluginError where it is declared, which every command does.
@@ -170,6 +175,17 @@ class Plugin:
         bundle_parts: ``module:function``: from a task to further JSON documents of an exported bundle, by the names of their files.
     """
 
+    FORMS = {
+        "operations": (_OPERATION,),
+        "navigation": (_TEXT, _PATH),
+        "templates": (_MODULE,),
+        "commands": (Command,),
+        "options": (_NAME, _PLACE),
+        "sections": (JobSection,),
+        **dict.fromkeys(("folders", "run_folders"), (_FOLDER,)),
+        **dict.fromkeys(("routers", "pages", "forms", "references", "bundle_parts"), (_PLACE,)),
+    }
+
     operations: tuple[str, ...] = ()
     routers: tuple[str, ...] = ()
     pages: tuple[str, ...] = ()
@@ -186,21 +202,10 @@ class Plugin:
 
     def __post_init__(self) -> None:
         """Raises PluginError for a field of another form, and for a folder that is Muster's own."""
-        _check_each("operations", self.operations, _OPERATION)
-        for field in ("routers", "pages", "forms"):
-            _check_each(field, getattr(self, field), _PLACE)
-        _check_each("navigation", self.navigation, _TEXT, _PATH)
-        _check_each("options", self.options, _NAME, _PLACE)
-        for field, kind in (("commands", Command), ("sections", JobSection)):
-            if odd := [each for each in _tuple(field, getattr(self, field)) if not isinstance(each, kind)]:
-                raise PluginError(f"{field}: expected {kind.__name__}(…), found {odd[0]!r:.80}")
+        super().__post_init__()
         for field, own in (("folders", OF_STORE), ("run_folders", OF_RUN)):
-            _check_each(field, getattr(self, field), _FOLDER)
             if taken := sorted(own.intersection(getattr(self, field))):
                 raise PluginError(f"{field}: {taken[0]} is a folder of Muster's own; choose another name")
-        for field, form in (("templates", _MODULE), ("references", _PLACE), ("bundle_parts", _PLACE)):
-            if getattr(self, field) != "":
-                _check(field, getattr(self, field), form)
 
 
 def load(place: str, kind: Any = object) -> Any:
@@ -238,16 +243,13 @@ def failed(place: str, error: BaseException) -> PluginError:
 def _imported(place: str) -> Any:
     module, _, name = place.partition(":")
     try:
-        found = import_module(module)
-        for each in filter(None, name.split(".")):
-            found = getattr(found, each)
+        return reduce(getattr, filter(None, name.split(".")), import_module(module))
     except PluginError:  # of a declaration, which the module makes
         raise
     except (Exception, SystemExit) as error:  # of somebody's code, which may do anything
         raise PluginError(
             f"{place} can't be imported ({_words(error)}); install its package again, or remove it"
         ) from error
-    return found
 
 
 def _words(error: BaseException) -> str:
@@ -259,21 +261,12 @@ def _words(error: BaseException) -> str:
 
 def _declared_in(place: str) -> str:
     """The plug-in and the field that name a part, for errors."""
+    quoted = repr(place), repr(place.removesuffix(":register"))
     for name, plugin in plugins().items():
         for field, value in vars(plugin).items():
-            if any(place in (text, f"{text}:register") for text in _texts(value)):
+            if any(each in repr(value) for each in quoted):  # a text, or one of those in it
                 return f"plug-in {name}: {field}"
     return "plug-in"
-
-
-def _texts(value: object) -> Iterator[str]:
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, tuple):
-        for each in value:
-            yield from _texts(each)
-    elif is_dataclass(value):
-        yield from _texts(tuple(vars(value).values()))
 
 
 @cache

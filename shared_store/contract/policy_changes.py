@@ -29,26 +29,26 @@ def differences(before: Contract, now: Contract, *, ranges: bool = False, of_rob
     if before.control_hz != now.control_hz:
         lines.append(f"the control rate {before.control_hz:g} Hz became {now.control_hz:g} Hz")
     for group in before.groups:
-        there = now.group(group.name)
-        if there is None:
+        same = now.group(group.name)
+        if same is None:
             lines.append(f"the observation group {group.name} is gone")
         else:
-            lines += _group_differences(group, there, ranges, left_out)
+            lines += _group_differences(group, same, ranges, left_out)
     lines += [f"the observation group {group.name} is new" for group in now.groups if not before.group(group.name)]
     lines += _named(_actions(before, left_out), _actions(now, left_out), "action")
     lines += _command_differences(before, now, ranges)
-    old, new = ({state.name: state.shape for state in each.states} for each in (before, now))
-    if old != new:
-        lines.append(f"the recurrent state {_states(old)} became {_states(new)}")
-    return lines
+    old, new = (
+        ", ".join(f"{state.name} {list(state.shape)}" for state in each.states) or "none" for each in (before, now)
+    )
+    return lines + ([f"the recurrent state {old} became {new}"] if old != new else [])
 
 
 def robot_changes(before: Sequence[RobotModel], now: Sequence[RobotModel]) -> list[str]:
     """The robots that load otherwise now than before, one line each; those that only one side knows don't count."""
-    there = {robot.name: robot for robot in before}
+    known = {robot.name: robot for robot in before}
     lines = []
     for robot in now:
-        then = there.get(robot.name)
+        then = known.get(robot.name)
         if then is None or then.digest == robot.digest:
             continue
         pairs = (
@@ -76,11 +76,8 @@ def _element_changes(before: RobotModel, now: RobotModel) -> Iterator[str]:
         for name in {**new[element], **old[element]}:
             pair = old[element].get(name, 0.0), new[element].get(name, 0.0)
             if not _same(*pair):
-                yield f"{element}: {name} {_shown(pair[0])} became {_shown(pair[1])}"
-
-
-def _shown(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:g}"
+                then, present = (each if isinstance(each, str) else f"{each:g}" for each in pair)
+                yield f"{element}: {name} {then} became {present}"
 
 
 def brief(lines: Sequence[str], most: int = 5) -> str:
@@ -95,7 +92,9 @@ def _group_differences(before: Group, now: Group, ranges: bool, left_out: Sequen
     if before.terms and now.terms:
         lines = _named(_columns(before, ranges, left_out), _columns(now, ranges, left_out), f"observation{of}")
     if before.image and now.image:
-        old, new = (_flat(dataclasses.asdict(each)) for each in (before.image, now.image))
+        old, new = (dataclasses.asdict(each) for each in (before.image, now.image))
+        for each in (old, new):
+            each.update(each.pop("camera"))  # its settings stand beside the others
         lines += [f"image{of}: {line}" for line in _changed(old, new)]
     if not lines and (before.shape, before.dtype) != (now.shape, now.dtype):
         lines.append(
@@ -109,17 +108,12 @@ def _columns(group: Group, ranges: bool, left_out: Sequence[str]) -> dict[str, d
     found = {}
     for term in group.terms:
         common: dict[str, Any] = {
-            "kind": term.kind,
-            "clip": term.clip,
-            "quantity": term.quantity,
-            "robot": term.robot,
-            "command": term.command,
+            **{name: getattr(term, name) for name in ("kind", "clip", "quantity", "robot", "command")},
             **{f"parameter {name}": value for name, value in term.parameters.items()},
             **{f"sensor {name}": value for name, value in term.sensors.items()},
             "frame": term.frame and (term.frame.body, *term.frame.position, *term.frame.rotation),
+            **({"delay": term.delay} if ranges else {}),
         }
-        if ranges:
-            common["delay"] = term.delay
         each = len(term.names) // len(term.elements) if term.elements else 0
         for back in range(term.history - 1, -1, -1):
             for index, name in enumerate(term.names):
@@ -143,13 +137,14 @@ def _actions(contract: Contract, left_out: Sequence[str]) -> dict[str, dict[str,
 
 
 def _command_differences(before: Contract, now: Contract, ranges: bool) -> list[str]:
-    old, new = ({each.name: each for each in contract.commands} for contract in (before, now))
-    lines = [f"the command {name} is gone" for name in old.keys() - new.keys()]
-    lines += [f"the command {name} is new" for name in new.keys() - old.keys()]
-    for name in sorted(old.keys() & new.keys()):
-        compared = ["names", "units", *(["ranges", "seconds"] if ranges else [])]
-        pairs = [{each: getattr(command, each) for each in compared} for command in (old[name], new[name])]
-        lines += [f"command {name}: {line}" for line in _changed(*pairs)]
+    compared = ("names", "units", *(("ranges", "seconds") if ranges else ()))
+    old, new = (
+        {each.name: {name: getattr(each, name) for name in compared} for each in contract.commands}
+        for contract in (before, now)
+    )
+    lines = [f"the command {name} is {'new' if name in new else 'gone'}" for name in old.keys() ^ new.keys()]
+    for name in old.keys() & new.keys():
+        lines += [f"command {name}: {line}" for line in _changed(old[name], new[name])]
     return sorted(lines)
 
 
@@ -193,12 +188,3 @@ def _value(value: Any) -> str:
     if value is None or value == "":
         return "none"
     return str(value)
-
-
-def _states(states: Mapping[str, tuple[int, ...]]) -> str:
-    return ", ".join(f"{name} {list(shape)}" for name, shape in states.items()) or "none"
-
-
-def _flat(value: Mapping[str, Any]) -> dict[str, Any]:
-    """The mapping, with the entries of ``camera`` beside the others."""
-    return {**{name: each for name, each in value.items() if name != "camera"}, **value["camera"]}

@@ -50,13 +50,11 @@ def find_group(controller: str) -> str:
             lines = [line.rstrip("\n").split(":", 2) for line in file]
         path = next(path for _, names, path in lines if controller in names.split(","))
         with open("/proc/self/mountinfo") as file:
-            mounts = [line.partition(" - ") for line in file]
-        wanted = [(head, tail.split()) for head, _, tail in mounts]
+            mounts = [(head.split()[3:5], tail.split()) for head, _, tail in (line.partition(" - ") for line in file)]
         root, point = next(
-            head.split()[3:5]
-            for head, (kind, _, options, *_) in wanted
-            if (controller in options.split(",") if controller else True)
-            and kind == ("cgroup" if controller else "cgroup2")
+            place
+            for place, (kind, _, options, *_) in mounts
+            if (kind == "cgroup" and controller in options.split(",") if controller else kind == "cgroup2")
         )
         directory = os.path.normpath(os.path.join(point, os.path.relpath(path, root)))
         trial = os.path.join(directory, f"muster-trial-{os.getpid()}-{time.monotonic_ns()}")
@@ -82,24 +80,26 @@ def members(group: str) -> list[Process]:
     return found
 
 
+def write_control(path: str, text: str) -> None:
+    """Write a control file, which must exist. Raises OSError."""
+    file = os.open(path, os.O_WRONLY)  # not open(): it must not make one
+    try:
+        os.write(file, text.encode())
+    finally:
+        os.close(file)
+
+
 def kill_group(group: str) -> None:
     """Send SIGKILL to the whole group at once, if the kernel can (Linux 5.14); do nothing if ``group`` is empty."""
-    if not group:
-        return
     with contextlib.suppress(OSError):
-        file = os.open(f"{group}/cgroup.kill", os.O_WRONLY)  # not open(): it must not make one
-        try:
-            os.write(file, b"1")
-        finally:
-            os.close(file)
+        if group:
+            write_control(f"{group}/cgroup.kill", "1")
 
 
 def remove_group(group: str) -> None:
     """Remove the group and those below it; leave groups alone that have processes or do not exist, and do nothing for an empty text."""
     for _ in range(_TRIES if group else 0):
-        for directory, _, _ in os.walk(group, topdown=False):
-            with contextlib.suppress(OSError):
-                os.rmdir(directory)
+        _remove_below(group)
         if not os.path.isdir(group):
             return
         time.sleep(0.02)  # processes still count for a moment after their death
@@ -108,7 +108,13 @@ def remove_group(group: str) -> None:
 def remove_abandoned_groups(directory: str) -> None:
     """Remove empty, old groups of nodes below ``directory``: leftovers of shims that were killed while no controller stopped the gang."""
     for entry in os.scandir(directory) if directory else ():
-        with contextlib.suppress(OSError):  # the kernel refuses if a process is in it
+        with contextlib.suppress(OSError):
             if entry.name.startswith("muster-") and time.time() - entry.stat().st_mtime > _NEW:
-                for below, _, _ in os.walk(entry.path, topdown=False):
-                    os.rmdir(below)
+                _remove_below(entry.path)
+
+
+def _remove_below(group: str) -> None:
+    """Remove a group and those below it, as far as they are empty: the kernel refuses those with processes."""
+    for directory, _, _ in os.walk(group, topdown=False):
+        with contextlib.suppress(OSError):
+            os.rmdir(directory)

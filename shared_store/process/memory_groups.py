@@ -9,7 +9,7 @@ import contextlib
 import errno
 import os
 
-from shared_store.process.cgroups import CONTROLLER, find_group, is_delegated
+from shared_store.process.cgroups import CONTROLLER, find_group, is_delegated, write_control
 
 _JOB = "job"
 
@@ -55,8 +55,8 @@ def make_memory_group(path: str, limit: int) -> None:
     above = os.path.dirname(path)
     if _is_newer(above):  # this process is in it, and it must have none to limit others
         os.makedirs(f"{above}/supervisor", exist_ok=True)
-        _write(f"{above}/supervisor/cgroup.procs", "0")
-        _write(f"{above}/cgroup.subtree_control", "+memory")
+        write_control(f"{above}/supervisor/cgroup.procs", "0")
+        write_control(f"{above}/cgroup.subtree_control", "+memory")
     os.makedirs(path, exist_ok=True)
     _limit(path, limit)
 
@@ -64,30 +64,30 @@ def make_memory_group(path: str, limit: int) -> None:
 def killed_for_memory(path: str) -> bool:
     """Whether the kernel has ended a process of the group because the memory was used up."""
     for name in ("memory.events", "memory.oom_control"):
-        try:
-            with open(f"{path}/{name}") as file:
-                counts = dict(line.split() for line in file)
-        except FileNotFoundError:
-            continue
-        return int(counts.get("oom_kill", 0)) > 0
+        with contextlib.suppress(FileNotFoundError):
+            words = _words(f"{path}/{name}")
+            return int(dict(zip(words[::2], words[1::2], strict=False)).get("oom_kill", 0)) > 0
     return False
 
 
 def _limit(path: str, limit: int) -> None:
     newer = _is_newer(path)
-    _write(f"{path}/{'memory.max' if newer else 'memory.limit_in_bytes'}", str(limit))
+    write_control(f"{path}/{'memory.max' if newer else 'memory.limit_in_bytes'}", str(limit))
     with contextlib.suppress(FileNotFoundError):  # a kernel that does not count swap
         # of version 1 it is memory and swap together: none beyond the memory, either way
         name, most = ("memory.swap.max", 0) if newer else ("memory.memsw.limit_in_bytes", limit)
-        _write(f"{path}/{name}", str(most))
+        write_control(f"{path}/{name}", str(most))
 
 
 def _has_memory(home: str, arrange: bool) -> bool:
     """Whether groups below ``home``, of version 2, can be limited."""
     if not arrange:
         return "memory" in _words(f"{home}/cgroup.subtree_control")
+    if "memory" not in _words(f"{home}/cgroup.controllers"):
+        return False
     try:
-        return _enable(home)
+        write_control(f"{home}/cgroup.subtree_control", "+memory")
+        return True
     except OSError as error:
         # systemd starts a service's processes in its own group, also again while nodes of the last start run below it
         if error.errno != errno.EBUSY or not (is_delegated(home) and home.endswith(".scope")):
@@ -96,16 +96,10 @@ def _has_memory(home: str, arrange: bool) -> bool:
         os.makedirs(f"{home}/{CONTROLLER}", exist_ok=True)
         for pid in _words(f"{home}/cgroup.procs"):
             with contextlib.suppress(ProcessLookupError):
-                _write(f"{home}/{CONTROLLER}/cgroup.procs", pid)
-        return _enable(home)
+                write_control(f"{home}/{CONTROLLER}/cgroup.procs", pid)
+        write_control(f"{home}/cgroup.subtree_control", "+memory")
     except OSError:
         return False
-
-
-def _enable(home: str) -> bool:
-    if "memory" not in _words(f"{home}/cgroup.controllers"):
-        return False
-    _write(f"{home}/cgroup.subtree_control", "+memory")
     return True
 
 
@@ -117,11 +111,3 @@ def _is_newer(directory: str) -> bool:
 def _words(path: str) -> list[str]:
     with open(path) as file:
         return file.read().split()
-
-
-def _write(path: str, text: str) -> None:
-    file = os.open(path, os.O_WRONLY)  # not open(): it must not make one
-    try:
-        os.write(file, text.encode())
-    finally:
-        os.close(file)

@@ -86,8 +86,8 @@ def marked(marks: Collection[str]) -> list[Process]:
 
     Raises ValueError without a mark, because all processes would match. Raises OSError as above.
     """
-    wanted = {mark.encode() for mark in marks}
-    if not wanted or any(not mark.partition(b"=")[2] for mark in wanted):
+    expected = {mark.encode() for mark in marks}
+    if not expected or any(not mark.partition(b"=")[2] for mark in expected):
         raise ValueError(f"no process can be identified by the marks {sorted(marks)}")
     found = []
     for pid in _pids():
@@ -95,7 +95,7 @@ def marked(marks: Collection[str]) -> list[Process]:
             continue
         try:
             with open(f"/proc/{pid}/environ", "rb") as file:
-                if not wanted <= set(file.read().split(b"\0")):
+                if not expected <= set(file.read().split(b"\0")):
                     continue
         except (FileNotFoundError, ProcessLookupError, PermissionError):  # gone, or another user's
             continue

@@ -96,16 +96,11 @@ def main(parent: str, group: str, files: str, exit_file: str, *command: str) -> 
     if code > 128:  # the supervisor did not get to remove it
         _remove_scratch(supervisor)
     if exit_file:
-        _leave(exit_file, code)
+        try:
+            os.write(os.open(exit_file, os.O_WRONLY | os.O_NOFOLLOW), f"{code:{_DIGITS}}".encode())
+        except OSError:
+            pass  # the engine has forgotten the node
     os._exit(code)
-
-
-def _leave(path: str, code: int) -> None:
-    try:
-        file = os.open(path, os.O_WRONLY | os.O_NOFOLLOW)
-        os.write(file, f"{code:{_DIGITS}}".encode())
-    except OSError:
-        pass  # the engine has forgotten the node
 
 
 def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:
@@ -118,13 +113,10 @@ def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (files, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
     if group:
         try:
-            if not os.path.isdir(group):
-                os.mkdir(group)
-            with open(os.path.join(group, "cgroup.procs"), "w") as file:
-                file.write("0")
+            os.mkdir(group)
         except OSError:
-            pass  # without a group the shim itself finds the remaining processes
-    tether.main(str(shim), "", "", *command)
+            pass  # it exists, or the tether reports that it can't be entered; the shim finds the remaining processes without it
+    tether.main(str(shim), "", group, *command)
 
 
 def _wait(supervisor: int, watched: set[signal.Signals]) -> int:
@@ -152,7 +144,7 @@ def _end_the_rest(group: str, call_stuck: Callable[[], object]) -> None:
     from shared_store.process.node_processes import end_descendants
     from shared_store.process.processes import unkillable
 
-    told = False
+    is_reported = False
     while True:
         try:
             stuck = end_descendants(group=group)
@@ -161,8 +153,8 @@ def _end_the_rest(group: str, call_stuck: Callable[[], object]) -> None:
             continue
         if not stuck:
             break
-        if not told:
-            told = True
+        if not is_reported:
+            is_reported = True
             print(f"muster: {unkillable(stuck)}", file=sys.stderr, flush=True)
             call_stuck()
     remove_group(group)
@@ -189,13 +181,12 @@ def _has_children() -> bool:
 
 
 def _remove_scratch(supervisor: int) -> None:
+    import glob
     import shutil
     import tempfile
 
-    directory, prefix = tempfile.gettempdir(), SCRATCH.format(pid=supervisor)
-    for name in os.listdir(directory):
-        if name.startswith(prefix):
-            shutil.rmtree(os.path.join(directory, name), ignore_errors=True)
+    for path in glob.glob(os.path.join(glob.escape(tempfile.gettempdir()), SCRATCH.format(pid=supervisor) + "*")):
+        shutil.rmtree(path, ignore_errors=True)
 
 
 if __name__ == "__main__":

@@ -59,21 +59,14 @@ def follow(parent: int) -> None:
         os._exit(1)
 
 
-def enter(group: str) -> None:
-    """Enter the control group in this directory."""
-    try:
-        file = os.open(f"{group}/cgroup.procs", os.O_WRONLY)
-        os.write(file, b"0")
-        os.close(file)
-    except OSError as error:
-        print(f"{group}/cgroup.procs: {error.strerror}", file=sys.stderr, flush=True)
-
-
 def main(parent: str, ignored: str, group: str, *command: str) -> None:
     """Become ``command``; if that fails, exit with 127 and one line on standard error."""
     follow(int(parent))
     if group:
-        enter(group)
+        try:
+            os.write(os.open(f"{group}/cgroup.procs", os.O_WRONLY | os.O_CLOEXEC), b"0")
+        except OSError as error:
+            print(f"{group}/cgroup.procs: {error.strerror}", file=sys.stderr, flush=True)
     # Python ignores some, and a parent may: nohup SIGHUP, a shell SIGINT of what it runs in the background
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
         signal.signal(number, signal.SIG_IGN if str(int(number)) in ignored.split(",") else signal.SIG_DFL)

@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -19,11 +18,25 @@ from typing import Any
 
 from shared_store.contract.documents import DocumentError
 from shared_store.contract.policy import Contract, read
-from shared_store.volume.files import DamagedFile, open_regular, read_json, sync_directory, sync_file, write_json
+from shared_store.volume import files
+from shared_store.volume.files import MANIFEST as MANIFEST
+from shared_store.volume.files import (
+    DamagedFile,
+    copy_file,
+    difference_of,
+    json_bytes,
+    manifest_entry,
+    read_json,
+    sync_directory,
+    sync_file,
+    write_json,
+)
+from shared_store.volume.files import hidden_folder as hidden_folder
+from shared_store.volume.files import publish as publish
 
 FORMAT = 1
 """Version of the manifest; a newer one is refused."""
-MANIFEST, CONTRACT, REPORT, POLICY = "manifest.json", "contract.json", "report.json", "policy.onnx"
+CONTRACT, REPORT, POLICY = "contract.json", "report.json", "policy.onnx"
 _PART = r"[A-Za-z0-9_][A-Za-z0-9._+-]{0,199}"
 _PATH = re.compile(rf"{_PART}(?:/{_PART}){{0,7}}")
 """Valid paths of a bundle's files: none leads out of it."""
@@ -40,42 +53,26 @@ def seal(bundle: Path, facts: Mapping[str, Any]) -> None:
         bundle: The directory, still without readers.
         facts: Further entries of the manifest; JSON values.
     """
-    files = {}
-    for path in _files(bundle):
+    entries = {path: manifest_entry(bundle / path) for path in _files(bundle)}
+    for path in entries:
         sync_file(bundle / path)
-        files[path] = {"size": (bundle / path).stat().st_size, "sha256": _digest(bundle / path)}
-    manifest = json.loads(json.dumps({**facts, "format": FORMAT, "files": files}))
+    manifest = json.loads(json.dumps({**facts, "format": FORMAT, "files": entries}))
     write_json(bundle / MANIFEST, {**manifest, "digest": _manifest_digest(manifest)})
-    for folder, _, _ in os.walk(bundle, topdown=False):
-        sync_directory(Path(folder))
+    _sync_folders(bundle)
 
 
 def read_manifest(bundle: Path) -> dict[str, Any]:
     """The manifest of a bundle. Raises DamagedBundle."""
-    try:
-        manifest = read_json(bundle / MANIFEST)
-    except (OSError, ValueError) as error:
-        raise DamagedBundle(f"bundle {bundle}: {MANIFEST} can't be read ({error})") from error
-    if manifest is None:
-        raise DamagedBundle(f"bundle {bundle}: {MANIFEST} is missing; is it a directory that `muster export` made?")
-    if not isinstance(manifest.get("format"), int):
-        raise DamagedBundle(f"bundle {bundle}: {MANIFEST} has no format")
-    if manifest["format"] > FORMAT:
-        raise DamagedBundle(
-            f"bundle {bundle}: has format {manifest['format']}, this Muster reads up to {FORMAT}; upgrade Muster"
-        )
-    files = manifest.get("files")
-    if not isinstance(files, dict) or not files:
-        raise DamagedBundle(f"bundle {bundle}: {MANIFEST} lists no files")
-    for path, entry in files.items():
-        if not _PATH.fullmatch(path) or path == MANIFEST:
-            raise DamagedBundle(f"bundle {bundle}: {MANIFEST} names {path[:60]!r}, which is no file of it")
-        if not isinstance(entry, dict) or not (
-            isinstance(entry.get("size"), int) and isinstance(entry.get("sha256"), str)
-        ):
-            raise DamagedBundle(f"bundle {bundle}: {MANIFEST} has no size and digest of {path}")
+
+    def damaged(why: str) -> DamagedBundle:
+        hint = "; is it a directory that `muster export` made?" if why == f"{MANIFEST} is missing" else ""
+        return DamagedBundle(f"bundle {bundle}: {why}{hint}")
+
+    manifest = files.read_manifest(bundle, _PATH, FORMAT, damaged, damaged)
+    if not manifest["files"]:
+        raise damaged(f"{MANIFEST} lists no files")
     if manifest.get("digest") != _manifest_digest(manifest):
-        raise DamagedBundle(f"bundle {bundle}: the content of {MANIFEST} was altered (SHA-256 differs)")
+        raise damaged(f"the content of {MANIFEST} was altered (SHA-256 differs)")
     return manifest
 
 
@@ -84,23 +81,21 @@ def verify(bundle: Path) -> dict[str, Any]:
     manifest = read_manifest(bundle)
     listed: dict[str, Any] = manifest["files"]
     try:
-        if (bundle / MANIFEST).read_bytes() != _written(manifest):  # differences that parsing hides, such as spaces
-            raise DamagedBundle(f"bundle {bundle}: the content of {MANIFEST} was altered")
-        there = set(_files(bundle)) - {MANIFEST}
-        for path in sorted(listed.keys() - there):
-            raise DamagedBundle(f"bundle {bundle}: {path} is missing")
-        for path in sorted(there - listed.keys()):
-            raise DamagedBundle(f"bundle {bundle}: {path} was added; {MANIFEST} does not list it")
-        for path, entry in sorted(listed.items()):
-            size = (bundle / path).stat().st_size
-            if size != entry["size"]:
-                raise DamagedBundle(f"bundle {bundle}: {path} has {size} bytes, {entry['size']} were written")
-            if _digest(bundle / path) != entry["sha256"]:
-                raise DamagedBundle(f"bundle {bundle}: the content of {path} was altered (SHA-256 differs)")
+        is_same = (bundle / MANIFEST).read_bytes() == json_bytes(
+            manifest
+        )  # parsing hides some differences, such as spaces
+        added = sorted(set(_files(bundle)) - {MANIFEST, *listed})
     except DamagedFile as error:
         raise DamagedBundle(f"bundle {bundle}: {error}") from None
     except OSError as error:
         raise DamagedBundle(f"bundle {bundle}: {error.filename} can't be read ({error.strerror})") from error
+    problems = [
+        "" if is_same else f"the content of {MANIFEST} was altered",
+        *(f"{path} was added; {MANIFEST} does not list it" for path in added),
+        *(difference_of(bundle, path, entry) for path, entry in sorted(listed.items())),
+    ]
+    if problem := next(filter(None, problems), ""):
+        raise DamagedBundle(f"bundle {bundle}: {problem}")
     return manifest
 
 
@@ -109,15 +104,21 @@ def reason(error: Exception, bundle: Path) -> str:
     return str(error).removeprefix(f"bundle {bundle}: ")
 
 
+def read_document(folder: Path, name: str, called: str) -> dict[str, Any]:
+    """A JSON document of a bundle or a model, which errors call ``called``. Raises DamagedBundle."""
+    try:
+        document = read_json(folder / name)
+    except (OSError, ValueError) as error:
+        raise DamagedBundle(f"{called}: {name} can't be read ({error})") from error
+    if document is None:
+        raise DamagedBundle(f"{called}: {name} is missing")
+    return document
+
+
 def read_contract(bundle: Path) -> Contract:
     """The policy contract of a bundle. Raises DamagedBundle."""
     try:
-        document = read_json(bundle / CONTRACT)
-        if document is None:
-            raise DamagedBundle(f"bundle {bundle}: {CONTRACT} is missing")
-        return read(document)
-    except (OSError, DamagedFile) as error:
-        raise DamagedBundle(f"bundle {bundle}: {CONTRACT} can't be read ({error})") from error
+        return read(read_document(bundle, CONTRACT, f"bundle {bundle}"))
     except DocumentError as error:
         raise DamagedBundle(f"bundle {bundle}: {error}") from None
 
@@ -132,48 +133,27 @@ def copy(bundle: Path, target: Path) -> None:
     """
     if os.path.lexists(target):
         raise FileExistsError(errno.EEXIST, "exists already", str(target))
-    target.parent.mkdir(parents=True, exist_ok=True)
-    hidden = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.tmp"
-    try:
+    with hidden_folder(target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.tmp") as hidden:
         copy_files(bundle, hidden)
         publish(hidden, target)
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def copy_files(bundle: Path, hidden: Path) -> None:
-    """Copy a bundle durably into the new directory ``hidden``, and verify the copy. Raises as :func:`copy`."""
-    manifest = verify(bundle)
-    hidden.mkdir()
-    for path in (*manifest["files"], MANIFEST):
+    """Copy a bundle durably into the directory ``hidden``, and verify the copy. Raises as :func:`copy`."""
+    for path in (*verify(bundle)["files"], MANIFEST):
         (hidden / path).parent.mkdir(parents=True, exist_ok=True)
-        with open_regular(bundle / path) as there, open(hidden / path, "wb") as here:
-            shutil.copyfileobj(there, here, 1 << 20)
-            here.flush()
-            os.fsync(here.fileno())
-    for folder, _, _ in os.walk(hidden, topdown=False):
-        sync_directory(Path(folder))
+        copy_file(bundle / path, hidden / path)
+    _sync_folders(hidden)
     verify(hidden)
 
 
-def publish(hidden: Path, target: Path) -> None:
-    """Rename a finished directory to ``target``, which must not exist or be empty. Raises FileExistsError, OSError."""
-    try:
-        os.rename(hidden, target)
-    except OSError as error:
-        if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
-            raise FileExistsError(errno.EEXIST, "exists already", str(target)) from None
-        raise
-    sync_directory(target.parent)
+def _sync_folders(bundle: Path) -> None:
+    for folder, _, _ in os.walk(bundle, topdown=False):
+        sync_directory(Path(folder))
 
 
 def _manifest_digest(manifest: Mapping[str, Any]) -> str:
-    return hashlib.sha256(_written({name: each for name, each in manifest.items() if name != "digest"})).hexdigest()
-
-
-def _written(manifest: Mapping[str, Any]) -> bytes:
-    """As :func:`shared_store.volume.files.write_json` writes it."""
-    return (json.dumps(manifest, indent=1, sort_keys=True) + "\n").encode()
+    return hashlib.sha256(json_bytes({name: each for name, each in manifest.items() if name != "digest"})).hexdigest()
 
 
 def _files(bundle: Path) -> list[str]:
@@ -186,8 +166,3 @@ def _files(bundle: Path) -> list[str]:
                 raise DamagedFile(f"{path.relative_to(bundle)} is not a regular file")
         found += [str((Path(folder) / name).relative_to(bundle)) for name in names]
     return sorted(found)
-
-
-def _digest(path: Path) -> str:
-    with open_regular(path) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -7,7 +7,6 @@ directory appears by a rename, after everything in it is durable. ``LATEST`` is 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import math
 import os
 import re
@@ -15,15 +14,17 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
 from shared_store.volume.epoch import StaleEpoch, check_epoch
 from shared_store.volume.evaluations import by_checkpoint, kept_checkpoints
 from shared_store.volume.files import (
-    DamagedFile,
-    open_regular,
-    read_json,
+    MANIFEST,
+    difference_of,
+    manifest_entry,
+    read_manifest,
     remove_tree,
     sync_directory,
     write_atomic,
@@ -61,30 +62,13 @@ class Checkpoint:
     @cached_property
     def manifest(self) -> dict[str, Any]:
         """The content of ``manifest.json``. Raises DamagedCheckpoint if it can't be read."""
-        try:
-            manifest = read_json(self.path / "manifest.json")
-        except (OSError, ValueError) as error:
-            raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json can't be read ({error})") from error
-        if manifest is None or not isinstance(manifest.get("files"), dict):
-            raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json is missing or empty")
-        for name, entry in manifest["files"].items():
-            if not _FILE.fullmatch(name):
-                raise DamagedCheckpoint(
-                    f"checkpoint {self.name}: manifest.json names {name[:60]!r}, which is no file of it"
-                )
-            if not isinstance(entry, dict) or not (
-                _is_size(entry.get("size")) and isinstance(entry.get("sha256"), str)
-            ):
-                raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json has no size and digest of {name}")
-        if not isinstance(manifest.get("format"), int):
-            raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json has no format")
-        if manifest["format"] > FORMAT:
-            raise NewerFormat(
-                f"checkpoint {self.name}: has format {manifest['format']}, this Muster reads up to {FORMAT}; upgrade Muster"
-            )
+        called = f"checkpoint {self.name}: "
+        manifest = read_manifest(
+            self.path, _FILE, FORMAT, lambda why: DamagedCheckpoint(called + why), lambda why: NewerFormat(called + why)
+        )
         for key in ("created", "reward", "score", "score_error", "worlds", "world_size"):
             if isinstance(manifest.get(key), str | list | dict):
-                raise DamagedCheckpoint(f"checkpoint {self.name}: manifest.json: {key} is not a number")
+                raise DamagedCheckpoint(f"{called}{MANIFEST}: {key} is not a number")
         return manifest
 
     @property
@@ -102,24 +86,8 @@ class Checkpoint:
     def verify(self) -> None:
         """Raises DamagedCheckpoint, naming the first file that is missing, truncated or altered."""
         for name, entry in sorted(self.manifest["files"].items()):
-            path = self.path / name
-            try:
-                with open_regular(path) as file:
-                    size = os.fstat(file.fileno()).st_size
-                    if size != entry["size"]:
-                        raise DamagedCheckpoint(
-                            f"checkpoint {self.name}: {name} has {size} bytes, {entry['size']} were written"
-                        )
-                    if hashlib.file_digest(file, "sha256").hexdigest() != entry["sha256"]:
-                        raise DamagedCheckpoint(
-                            f"checkpoint {self.name}: the content of {name} was altered (SHA-256 differs)"
-                        )
-            except DamagedFile:
-                raise DamagedCheckpoint(f"checkpoint {self.name}: {name} is not a regular file") from None
-            except FileNotFoundError:
-                raise DamagedCheckpoint(f"checkpoint {self.name}: {name} is missing") from None
-            except OSError as error:
-                raise DamagedCheckpoint(f"checkpoint {self.name}: {name} can't be read ({error.strerror})") from error
+            if problem := difference_of(self.path, name, entry):
+                raise DamagedCheckpoint(f"checkpoint {self.name}: {problem}")
 
 
 def checkpoint_called(directory: Path, name: str) -> Checkpoint | None:
@@ -161,7 +129,8 @@ def newest_checkpoint(
     Raises:
         DamagedCheckpoint: The chosen one is missing or does not verify; no other replaces a person's choice.
     """
-    for checkpoint in reversed(list_checkpoints(run)):
+    checkpoints = list_checkpoints(run)
+    for checkpoint in reversed(checkpoints):
         if chosen is not None and checkpoint.epoch < chosen_since:
             break
         try:
@@ -172,11 +141,11 @@ def newest_checkpoint(
                 damaged(checkpoint, error)
     if chosen is None:
         return None
-    for checkpoint in list_checkpoints(run):
-        if checkpoint.name == chosen:
-            checkpoint.verify()
-            return checkpoint
-    raise DamagedCheckpoint(f"checkpoint {chosen}: not in run {run.name}")
+    found = next((checkpoint for checkpoint in checkpoints if checkpoint.name == chosen), None)
+    if found is None:
+        raise DamagedCheckpoint(f"checkpoint {chosen}: not in run {run.name}")
+    found.verify()
+    return found
 
 
 def best_checkpoint(run: Run) -> Checkpoint | None:
@@ -190,15 +159,8 @@ def best_checkpoint(run: Run) -> Checkpoint | None:
     evaluated = by_checkpoint(run)
     if len(evaluated) > 1 and (judged := best_evaluated(checkpoints, evaluated)):
         return judged
-    best, found = None, -math.inf
-    for checkpoint in checkpoints:
-        try:
-            score = checkpoint.manifest.get("score")
-        except DamagedCheckpoint:
-            continue
-        if isinstance(score, int | float) and found <= score < math.inf:
-            best, found = checkpoint, score
-    return best
+    scored = [(score, c) for c in reversed(checkpoints) if (score := _score(c, "score")) is not None]
+    return max(scored, key=lambda pair: pair[0], default=(0.0, None))[1]
 
 
 def best_evaluated(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Mapping[str, Any]]) -> Checkpoint | None:
@@ -214,11 +176,9 @@ def best_evaluated(checkpoints: Sequence[Checkpoint], evaluated: Mapping[str, Ma
 
 def set_aside(checkpoint: Checkpoint) -> Path:
     """Take a damaged checkpoint out of the listing without deleting it; returns its new path."""
-    target = checkpoint.path.with_name(f"{checkpoint.name}.damaged")
-    suffix = 1
-    while target.exists():
-        suffix += 1
-        target = checkpoint.path.with_name(f"{checkpoint.name}.damaged-{suffix}")
+    suffixes = chain((".damaged",), (f".damaged-{number}" for number in count(2)))
+    names = (checkpoint.path.with_name(f"{checkpoint.name}{suffix}") for suffix in suffixes)
+    target = next(path for path in names if not path.exists())
     os.rename(checkpoint.path, target)
     sync_directory(target.parent)
     return target
@@ -293,9 +253,7 @@ class CheckpointWriter:
         for notes in self.path.glob(".*"):
             notes.unlink()
         files = digests or {
-            entry.name: {"size": entry.stat().st_size, "sha256": _digest(Path(entry.path))}
-            for entry in sorted(os.scandir(self.path), key=lambda entry: entry.name)
-            if entry.name != "manifest.json"
+            name: manifest_entry(self.path / name) for name in sorted(os.listdir(self.path)) if name != MANIFEST
         }
         manifest = {
             "format": FORMAT,
@@ -304,7 +262,7 @@ class CheckpointWriter:
             "created": time.time(),
             "files": files,
         }
-        write_json(self.path / "manifest.json", {**facts, **manifest}, parents=False)
+        write_json(self.path / MANIFEST, {**facts, **manifest}, parents=False)
 
 
 def retain(run: Run, keep: int) -> list[str]:
@@ -312,33 +270,23 @@ def retain(run: Run, keep: int) -> list[str]:
     evaluated one, and those of finished or pending exports and of evaluations that keep their checkpoint; returns the deleted names.
     """
     checkpoints = list_checkpoints(run)
-    scored = [(score, c.name) for c in checkpoints if (score := _score(c)) is not None]
+    scored = [(score, c.name) for c in checkpoints if (score := _score(c, "score", "reward")) is not None]
     scheduled = [c for c in checkpoints if c.is_scheduled]
-    kept = {c.name for c in (*scheduled[-max(1, keep) :], *checkpoints[-1:])} | ({max(scored)[1]} if scored else set())
-    kept |= kept_checkpoints(run)
     best = best_evaluated(checkpoints, by_checkpoint(run))
-    kept |= {best.name} if best else set()
-    kept |= {path.name for path in run.exports.glob("*")}
+    kept = {c.name for c in (*scheduled[-max(1, keep) :], *checkpoints[-1:], *filter(None, (best,)))}
+    kept |= {max(scored)[1]} if scored else set()
+    kept |= kept_checkpoints(run) | {path.name for path in run.exports.glob("*")}
     deleted = [checkpoint for checkpoint in checkpoints if checkpoint.name not in kept]
     for checkpoint in deleted:
         remove_tree(checkpoint.path)
     return [checkpoint.name for checkpoint in deleted]
 
 
-def _score(checkpoint: Checkpoint) -> float | None:
-    """The policy's score: ``score`` of the manifest, or ``reward`` in one that an older Muster wrote."""
+def _score(checkpoint: Checkpoint, *keys: str) -> float | None:
+    """The first of these numbers in its manifest, if it is finite; an older Muster wrote ``reward`` for ``score``."""
     try:
         manifest = checkpoint.manifest
     except DamagedCheckpoint:
         return None
-    score = manifest.get("score", manifest.get("reward"))
+    score = next((manifest[key] for key in keys if key in manifest), None)
     return float(score) if isinstance(score, int | float) and math.isfinite(score) else None
-
-
-def _is_size(value: object) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 2**63
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

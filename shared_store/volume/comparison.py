@@ -6,6 +6,7 @@ import json
 from bisect import bisect_right
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from statistics import fmean, stdev
 from typing import Any
@@ -47,12 +48,8 @@ class ComparedRun:
 
     def curve(self, metric: str = "reward") -> list[tuple[float, float]]:
         """Environment steps and a metric, where it has a value: the mean return where episodes have ended."""
-        told = ((record.get("env_steps"), record.get(metric)) for record in self.records)
-        return [
-            (float(steps), float(value))
-            for steps, value in told
-            if isinstance(steps, int | float) and isinstance(value, int | float)
-        ]
+        points = ((record.get("env_steps"), record.get(metric)) for record in self.records)
+        return [(float(x), float(y)) for x, y in points if isinstance(x, int | float) and isinstance(y, int | float)]
 
     def last(self, key: str) -> float | None:
         """A number of the newest record."""
@@ -86,40 +83,35 @@ class RunGroup:
 
     def describe(self) -> dict[str, Any]:
         """As JSON values."""
+        successes = [each.get("success") for each in self.evaluations]
+        shares = [each.get("share") for each in successes if isinstance(each, Mapping)]
         return {
             "runs": [run.name for run in self.runs],
             "seeds": [run.train.get("seed") for run in self.runs],
             "task": self.runs[0].train.get("task"),
             **{key: _spread(self.numbers(key)) for key in ("iteration", "env_steps", "reward", "episode_length")},
             "evaluated": _spread([each["mean_return"] for each in self.evaluations]),
-            "success": _spread(self._successes()),
+            "success": _spread([float(share) for share in shares if isinstance(share, int | float)]),
             "evaluations": self.evaluations,
         }
 
     def cells(self) -> list[str]:
         """A row of the table, by :data:`COLUMNS`."""
-        seeds = ", ".join(str(run.train.get("seed", "-")) for run in self.runs)
-        evaluated = [each["mean_return"] for each in self.evaluations]
-        shares = [100 * share for share in self._successes()]
-        told = self.evaluations[0].get("return") if len(self.evaluations) == 1 else None
-        high = told.get("high") if isinstance(told, Mapping) else None
-        single = f"{evaluated[0]:.2f} ± {high - evaluated[0]:.2f}" if isinstance(high, int | float) else None
+        facts = self.describe()
+        returns = self.evaluations[0].get("return") if len(self.evaluations) == 1 else None
+        high = returns.get("high") if isinstance(returns, Mapping) else None
+        mean = facts["evaluated"] and facts["evaluated"]["mean"]
         return [
             self.label,
-            seeds,
+            ", ".join(str(run.train.get("seed", "-")) for run in self.runs),
             str(self.runs[0].train.get("task", "-")),
-            _shown(self.numbers("iteration"), ".0f"),
-            _shown(self.numbers("env_steps"), ",.0f"),
-            _shown(self.numbers("reward"), ".2f"),
-            _shown(self.numbers("episode_length"), ".1f"),
-            single or _shown(evaluated, ".2f"),
-            f"{_shown(shares, '.1f')} %" if shares else "-",
+            _shown(facts["iteration"], ".0f"),
+            _shown(facts["env_steps"], ",.0f"),
+            _shown(facts["reward"], ".2f"),
+            _shown(facts["episode_length"], ".1f"),
+            f"{mean:.2f} ± {high - mean:.2f}" if isinstance(high, int | float) else _shown(facts["evaluated"], ".2f"),
+            f"{_shown(facts['success'], '.1f', 100)} %" if facts["success"] else "-",
         ]
-
-    def _successes(self) -> list[float]:
-        told = [each.get("success") for each in self.evaluations]
-        shares = [each.get("share") for each in told if isinstance(each, Mapping)]
-        return [float(share) for share in shares if isinstance(share, int | float)]
 
     def curve(self, metric: str = "reward", at: Sequence[float] | None = None) -> list[tuple[float, float, float, int]]:
         """Steps, mean of a metric (the return) over its runs, their standard deviation, and how many they are.
@@ -131,17 +123,13 @@ class RunGroup:
             at: The steps that are wanted; as far as the longest run went where None.
         """
         curves = [curve for run in self.runs if (curve := run.curve(metric))]
-        if not curves:
-            return []
-        points = at
-        if points is None:
-            single = len(curves) == 1
-            points = [steps for steps, _ in curves[0]] if single else spaced(span(curves), POINTS)
+        if at is None and curves:
+            at = [steps for steps, _ in curves[0]] if len(curves) == 1 else spaced(span(curves), POINTS)
         found = []
-        for steps in points:
-            there = [value for curve in curves if (value := _at(curve, steps)) is not None]
-            if there:
-                found.append((steps, fmean(there), stdev(there) if len(there) > 1 else 0.0, len(there)))
+        for steps in at or ():
+            values = [value for curve in curves if (value := _at(curve, steps)) is not None]
+            if values:
+                found.append((steps, fmean(values), stdev(values) if len(values) > 1 else 0.0, len(values)))
         return found
 
 
@@ -187,12 +175,6 @@ def grouped(runs: Iterable[ComparedRun]) -> list[RunGroup]:
     return [RunGroup(each) for each in groups.values()]
 
 
-def same_episodes(new: ComparedRun, old: ComparedRun) -> tuple[Mapping[str, Any], Mapping[str, Any]] | None:
-    """An evaluation of each of two runs on the same episodes: the pair with the most common episodes; None without any."""
-    both = [(a, b) for a in new.evaluations for b in old.evaluations if are_paired(a, b)]
-    return max(both, key=lambda pair: min(pair[0]["episodes"], pair[1]["episodes"]), default=None)
-
-
 def versus(group: RunGroup, first: RunGroup) -> dict[str, Any] | None:
     """The difference of a single run from the first one in the same episodes; None where they have none, or these can't be read here.
 
@@ -201,27 +183,26 @@ def versus(group: RunGroup, first: RunGroup) -> dict[str, Any] | None:
     """
     if group is first or len(group.runs) > 1 or len(first.runs) > 1:
         return None
-    new, old = group.runs[0], first.runs[0]
-    pair = same_episodes(new, old)
+    both = group.runs[0], first.runs[0]
+    pairs = [pair for pair in product(*(run.evaluations for run in both)) if are_paired(*pair)]
+    pair = max(pairs, key=lambda pair: min(each["episodes"] for each in pair), default=None)
     if pair is None:
         return None
-    tables = [
-        Path(run.path) / "evaluations" / f"{each['name']}.parquet" for run, each in zip((new, old), pair, strict=True)
-    ]
+    tables = [Path(run.path) / f"evaluations/{each['name']}.parquet" for run, each in zip(both, pair, strict=True)]
     try:
-        told = paired(*map(read_returns, tables))
+        compared = paired(*map(read_returns, tables))
     except (ImportError, OSError, ValueError):  # the store is on another machine, say
         return None
-    names = [f"{run.name}@{each.get('iteration')}" for run, each in zip((new, old), pair, strict=True)]
-    return {"new": names[0], "old": names[1], **told}
+    names = [f"{run.name}@{each.get('iteration')}" for run, each in zip(both, pair, strict=True)]
+    return {"new": names[0], "old": names[1], **compared}
 
 
-def sentence(told: Mapping[str, Any]) -> str:
+def sentence(result: Mapping[str, Any]) -> str:
     """The result of :func:`versus`, in words."""
-    low, high = (f"{end:+.2f}" if end is not None else "-" for end in (told["low"], told["high"]))
+    low, high = (f"{end:+.2f}" if end is not None else "-" for end in (result["low"], result["high"]))
     return (
-        f"{told['new']} against {told['old']}: return {told['difference']:+.2f} ({low} to {high}, paired over "
-        f"{counted(told['pairs'], 'episode')}): {told['verdict']}"
+        f"{result['new']} against {result['old']}: return {result['difference']:+.2f} ({low} to {high}, paired over "
+        f"{counted(result['pairs'], 'episode')}): {result['verdict']}"
     )
 
 
@@ -229,21 +210,17 @@ def _at(curve: Sequence[tuple[float, float]], steps: float) -> float | None:
     """The value of a curve, linearly interpolated; None outside."""
     if not curve[0][0] <= steps <= curve[-1][0]:
         return None
-    index = bisect_right(curve, steps, key=lambda point: point[0])
-    if index == len(curve):
-        return curve[-1][1]
+    index = min(bisect_right(curve, steps, key=lambda point: point[0]), len(curve) - 1)
     (before, low), (after, high) = curve[index - 1], curve[index]
-    return low + (high - low) * (steps - before) / (after - before)
+    return low + (high - low) * (steps - before) / (after - before) if steps < after else high
 
 
 def _spread(values: Sequence[float]) -> dict[str, float | None] | None:
-    if not values:
-        return None
-    return {"mean": fmean(values), "std": stdev(values) if len(values) > 1 else None}
+    return {"mean": fmean(values), "std": stdev(values) if len(values) > 1 else None} if values else None
 
 
-def _shown(values: Sequence[float], pattern: str) -> str:
-    if not values:
+def _shown(spread: Mapping[str, float | None] | None, pattern: str, scale: float = 1) -> str:
+    if not spread or spread["mean"] is None:
         return "-"
-    mean = format(fmean(values), pattern)
-    return f"{mean} ± {format(stdev(values), pattern)}" if len(values) > 1 and len(set(values)) > 1 else mean
+    shown = format(scale * spread["mean"], pattern)
+    return f"{shown} ± {format(scale * spread['std'], pattern)}" if spread["std"] else shown

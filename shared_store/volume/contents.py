@@ -47,41 +47,22 @@ def contents(run: Run) -> Contents:
     for entry in sorted(os.scandir(run.path), key=lambda entry: entry.name):
         if claim := _CLAIM.fullmatch(entry.name):
             epoch = max(epoch, int(claim[1]))
-        elif entry.name in OF_JOBS:
-            jobs, others = _jobs_in(Path(entry.path))
+        elif entry.name in OF_JOBS and entry.is_dir(follow_symlinks=False):
+            jobs = {each.name for each in os.scandir(entry.path) if each.is_dir(follow_symlinks=False)}
             logged |= jobs
-            results += [f"{entry.name}/{name}" for name in others]
+            results += [f"{entry.name}/{name}" for name in sorted({*os.listdir(entry.path)} - jobs)]
         elif not _RECORDS.fullmatch(entry.name) and (not entry.is_dir(follow_symlinks=False) or _has_files(entry.path)):
             results.append(entry.name)
     return Contents(tuple(results), frozenset(logged), epoch)
 
 
-def _jobs_in(directory: Path) -> tuple[set[str], list[str]]:
-    """The jobs that have a directory there, and names of anything else."""
-    jobs, others = set(), []
-    try:
-        for entry in os.scandir(directory):
-            if entry.is_dir(follow_symlinks=False):
-                jobs.add(entry.name)
-            else:
-                others.append(entry.name)
-    except NotADirectoryError:
-        others.append("")
-    return jobs, sorted(others)
-
-
 def _has_files(directory: str) -> bool:
     """Whether anything but directories lies below it; one that can't be read may have something."""
-    found = False
-
-    def fail(_error: OSError) -> None:
-        nonlocal found
-        found = True
-
-    for folder, folders, names in os.walk(directory, onerror=fail):
+    unreadable: list[OSError] = []
+    for folder, folders, names in os.walk(directory, onerror=unreadable.append):
         if names or any(os.path.islink(os.path.join(folder, each)) for each in folders):
             return True
-    return found
+    return bool(unreadable)
 
 
 def archived(run: Run) -> dict[str, Any] | None:

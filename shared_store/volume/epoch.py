@@ -14,9 +14,8 @@ import re
 import socket
 import time
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
-from shared_store.volume.files import open_regular, refuse_links, sync_directory, write_atomic
+from shared_store.volume.files import open_regular, read_json, refuse_links, sync_directory, write_atomic
 from shared_store.volume.layout import Run, StoreError
 
 LARGEST_EPOCH = 10**15 - 1
@@ -53,7 +52,7 @@ def read_epoch(run: Run) -> int:
     except FileNotFoundError:
         return 0
     if not re.fullmatch(r"[0-9]{1,15}", text):
-        raise ValueError(f"{path}: expected a whole number of at most 15 digits, found {text!r}")
+        raise ValueError(f"{path}: expected an integer of at most 15 digits, found {text!r}")
     return int(text)
 
 
@@ -90,10 +89,9 @@ def raise_epoch(run: Run, epoch: int, claim: Claim | None = None) -> None:
 def read_claim(run: Run, epoch: int) -> Claim | None:
     """The open attempt that has ``epoch``; None if it is closed, unknown or damaged. Raises OSError."""
     try:
-        with open_regular(_claim_path(run, epoch)) as file:
-            value = json.loads(file.read(_LONGEST_CLAIM))
+        value = read_json(run.path / f"EPOCH.{epoch}", _LONGEST_CLAIM) or {}
         return Claim(str(value["controller"]), str(value["job"]), int(value["attempt"]))
-    except (FileNotFoundError, ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError):
         return None
 
 
@@ -103,7 +101,7 @@ def close_claim(run: Run, epoch: int) -> None:
     Raises OSError; DamagedFile if the run is a link, or the file is not a regular one.
     """
     refuse_links(run.path, 1)
-    with contextlib.suppress(FileNotFoundError), open_regular(_claim_path(run, epoch), write=True) as file:
+    with contextlib.suppress(FileNotFoundError), open_regular(run.path / f"EPOCH.{epoch}", write=True) as file:
         file.truncate()
         os.fsync(file.fileno())
 
@@ -152,7 +150,7 @@ def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
     refuse_links(run.path, 1)
     run.path.mkdir(parents=True, exist_ok=True)
     try:
-        descriptor = os.open(_claim_path(run, epoch), os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
+        descriptor = os.open(run.path / f"EPOCH.{epoch}", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     except FileExistsError:
         return False
     with open(descriptor, "wb") as file:
@@ -183,10 +181,6 @@ def _publish(run: Run, epoch: int) -> None:
         claim = re.fullmatch(r"EPOCH\.([0-9]{1,15})", name)
         if claim and int(claim[1]) < epoch - _KEPT:
             (run.path / name).unlink(missing_ok=True)
-
-
-def _claim_path(run: Run, epoch: int) -> Path:
-    return run.path / f"EPOCH.{epoch}"
 
 
 def _stale(run: Run, epoch: int, current: int) -> StaleEpoch:

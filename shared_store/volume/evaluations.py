@@ -35,28 +35,27 @@ def evaluation_name(checkpoint: str, job: str = "") -> str:
 
 def checkpoint_of(name: str) -> str | None:
     """Name of the checkpoint of the evaluation ``name``; None for an invalid name."""
-    match = _NAME.fullmatch(name)
-    return match[1] if match else None
+    return match[1] if (match := _NAME.fullmatch(name)) else None
 
 
 def list_evaluations(run: Run) -> list[dict[str, Any]]:
     """The summaries of a run's evaluations, the newest last; damaged ones are skipped. Raises OSError."""
-    try:
-        names = [path.stem for path in run.evaluations.glob("*.json")]
-    except FileNotFoundError:
-        return []
-    found = [(name, _read(run, name)) for name in names if checkpoint_of(name)]
-    sound = [{**summary, "name": name, "checkpoint": checkpoint_of(name)} for name, summary in found if summary]
-    return sorted(sound, key=lambda summary: (summary["time"], summary["name"]))
+    found = [
+        {**summary, "name": name, "checkpoint": checkpoint} for name, checkpoint, summary in _summaries(run) if summary
+    ]
+    return sorted(found, key=lambda summary: (summary["time"], summary["name"]))
 
 
-def _read(run: Run, name: str) -> dict[str, Any] | None:
-    try:
-        summary = read_json(run.evaluations / f"{name}.json", LARGEST_DESCRIPTION)
-    except DamagedFile:
-        return None
-    numbers = [summary.get(key) for key in _NUMBERS] if summary else [None]
-    return summary if all(finite(number) is not None for number in numbers) else None
+def _summaries(run: Run) -> Iterator[tuple[str, str, dict[str, Any] | None]]:
+    """Name, checkpoint and summary of each evaluation; None for a damaged one."""
+    for name in [path.stem for path in run.evaluations.glob("*.json")]:
+        if checkpoint := checkpoint_of(name):
+            try:
+                summary = read_json(run.evaluations / f"{name}.json", LARGEST_DESCRIPTION)
+            except DamagedFile:
+                summary = None
+            numbers = [summary.get(key) for key in _NUMBERS] if summary else [None]
+            yield name, checkpoint, summary if all(finite(number) is not None for number in numbers) else None
 
 
 def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
@@ -70,7 +69,7 @@ def by_checkpoint(run: Run) -> dict[str, dict[str, Any]]:
 
 
 def keep_for_evaluation(run: Run, checkpoint: str) -> None:
-    """Protect the checkpoint of a pending evaluation from retention, in place of an earlier one. Raises as :func:`evaluation_is_over`."""
+    """Protect the checkpoint of a pending evaluation from retention, in place of an earlier one. Raises as :func:`release_from_evaluation`."""
     refuse_links(run.evaluations, 2)
     write_atomic(run.evaluations / f"{checkpoint}.wanted", b"")
     for path in run.evaluations.glob("*.wanted"):
@@ -78,13 +77,13 @@ def keep_for_evaluation(run: Run, checkpoint: str) -> None:
             path.unlink(missing_ok=True)
 
 
-def evaluation_is_over(run: Run, checkpoint: str) -> None:
+def release_from_evaluation(run: Run, checkpoint: str) -> None:
     """End the protection of :func:`keep_for_evaluation`. Raises DamagedFile if a link leads out of the run, OSError."""
     refuse_links(run.evaluations, 2)
     (run.evaluations / f"{checkpoint}.wanted").unlink(missing_ok=True)
 
 
-def wanted_checkpoints(run: Run) -> set[str]:
+def pending_checkpoints(run: Run) -> set[str]:
     """Names of the checkpoints of pending evaluations, from :func:`keep_for_evaluation`."""
     return {path.stem for path in run.evaluations.glob("*.wanted")}
 
@@ -95,12 +94,9 @@ def kept_checkpoints(run: Run) -> set[str]:
     These are the checkpoints of pending and finished evaluations, unless every evaluation of a checkpoint says that it need not be
     kept; of the latter, only the best.
     """
-    kept = wanted_checkpoints(run)
-    for path in run.evaluations.glob("*.json"):
-        summary = _read(run, path.stem) if checkpoint_of(path.stem) else None
-        if summary is None or summary.get("keep", True):  # also if it can't be read: keeping is safe
-            kept.add(checkpoint_of(path.stem) or path.stem)
-    return kept
+    # also what can't be read: keeping is safe
+    kept = {checkpoint for _, checkpoint, summary in _summaries(run) if summary is None or summary.get("keep", True)}
+    return kept | pending_checkpoints(run)
 
 
 def in_one_line(summary: Mapping[str, Any]) -> str:
@@ -131,7 +127,7 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
         return
     task, seed = summary.get("task"), summary.get("seed")
     yield f"{counted(summary['episodes'], 'episode')} of {task}, checkpoint {summary['checkpoint']}, seed {seed}"
-    for place, value in told_changes(summary):
+    for place, value in changes_in_lines(summary):
         yield f"  with config.{place}: {value}"
     rewards, metrics = _mapping(summary, "rewards"), _mapping(summary, "metrics")
     largest = sorted(rewards, key=lambda name: -abs(_mapping(rewards, name).get("mean") or 0.0))
@@ -154,7 +150,7 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
         yield _comparison(compared)
 
 
-def told_changes(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
+def changes_in_lines(summary: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """How the worlds of an evaluation differ from the training's, by place, each in one line: a longer text only by its size."""
     for place, value in flattened(_mapping(summary, "config")):
         rows = value.splitlines() if isinstance(value, str) else []
@@ -172,14 +168,14 @@ def flattened(config: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
 
 def _comparison(compared: Mapping[str, Any]) -> str:
     when = compared.get("time")
-    there = time.strftime(" of %Y-%m-%d %H:%M", time.localtime(when)) if isinstance(when, int | float) else ""
+    date = time.strftime(" of %Y-%m-%d %H:%M", time.localtime(when)) if isinstance(when, int | float) else ""
     others = " in other worlds" if compared.get("other_worlds") else ""
-    told = _mapping(compared, "return")
-    method = f"paired over {counted(told['pairs'], 'episode')}" if isinstance(told.get("pairs"), int) else "Welch"
-    interval = f" ({_number(told.get('low'), '+')} to {_number(told.get('high'), '+')}, {method})"
+    returns = _mapping(compared, "return")
+    method = f"paired over {counted(returns['pairs'], 'episode')}" if isinstance(returns.get("pairs"), int) else "Welch"
+    low, high, difference = (_number(returns.get(key), "+") for key in ("low", "high", "difference"))
     return (
-        f"compared with the evaluation{there} of checkpoint {compared.get('checkpoint')}{others}: "
-        f"return {_number(told.get('difference'), '+')}{interval}: {told.get('verdict')}"
+        f"compared with the evaluation{date} of checkpoint {compared.get('checkpoint')}{others}: "
+        f"return {difference} ({low} to {high}, {method}): {returns.get('verdict')}"
     )
 
 

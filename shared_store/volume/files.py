@@ -7,25 +7,28 @@ full disk at the close), is renamed, and the directory is fsynced.
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from io import BufferedRandom, BufferedReader
 from pathlib import Path
 from typing import Any
 
+MANIFEST = "manifest.json"
+"""Of an immutable directory: its ``files`` have the size and the SHA-256 of each of the others."""
 LARGEST_JSON = 16 << 20
 """Bytes of a JSON file; Muster writes no larger one."""
 DEEPEST_JSON = 100
 """Levels of lists and objects in a JSON file."""
 LONGEST_WHOLE = 1000
 """Bits of a whole number in a JSON file."""
-
-
 _INSIDE = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -33,9 +36,9 @@ class DamagedFile(ValueError):
     """A file of the store can't be used; the message names the file and the error in one line."""
 
 
-def sync_file(path: Path) -> None:
+def sync_file(path: Path, flags: int = os.O_RDONLY) -> None:
     """Make the content of ``path`` durable. Raises OSError (ENOSPC, EIO) if the volume could not keep it."""
-    descriptor = os.open(path, os.O_RDONLY)
+    descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)
     finally:
@@ -44,11 +47,7 @@ def sync_file(path: Path) -> None:
 
 def sync_directory(path: Path) -> None:
     """Make the names in directory ``path`` durable."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+    sync_file(path, os.O_RDONLY | os.O_DIRECTORY)
 
 
 def write_atomic(path: Path, data: bytes, mode: int = 0o666, *, parents: bool = True) -> None:
@@ -78,7 +77,12 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o666, *, parents: bool = 
 
 def write_json(path: Path, value: Mapping[str, Any], mode: int = 0o666, *, parents: bool = True) -> None:
     """:func:`write_atomic` for a JSON document."""
-    write_atomic(path, (json.dumps(value, indent=1, sort_keys=True) + "\n").encode(), mode, parents=parents)
+    write_atomic(path, json_bytes(value), mode, parents=parents)
+
+
+def json_bytes(value: Mapping[str, Any]) -> bytes:
+    """The content of the file that :func:`write_json` writes."""
+    return (json.dumps(value, indent=1, sort_keys=True) + "\n").encode()
 
 
 def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:
@@ -92,9 +96,12 @@ def read_json(path: Path, largest: int = LARGEST_JSON) -> dict[str, Any] | None:
         OSError: The volume can't be read.
     """
     try:
-        data = _read_regular(path, largest)
+        with open_regular(path) as file:
+            data = file.read(largest + 1)
     except (FileNotFoundError, NotADirectoryError):
         return None
+    if len(data) > largest:
+        raise DamagedFile(f"{path}: more than {largest} bytes")
     return json_object(data, str(path))
 
 
@@ -115,7 +122,7 @@ def json_object(data: bytes | str, name: str) -> dict[str, Any]:
     return value
 
 
-def is_there(path: Path) -> bool:
+def path_exists(path: Path) -> bool:
     """Whether there is anything, also a link that leads nowhere. Raises OSError where that can't be seen."""
     try:
         os.lstat(path)
@@ -167,22 +174,14 @@ def open_inside(directory: Path, parts: Sequence[str]) -> BufferedReader | Buffe
         os.close(found)
 
 
-def _read_regular(path: Path, largest: int) -> bytes:
-    with open_regular(path) as file:
-        data = file.read(largest + 1)
-    if len(data) > largest:
-        raise DamagedFile(f"{path}: more than {largest} bytes")
-    return data
-
-
 def _check_plain(value: object, data: bytes) -> None:
     """Raise ValueError for a value that can be read, but not written again as JSON."""
     level = [value]
     for _ in range(DEEPEST_JSON):
-        if any(isinstance(each, float) and not math.isfinite(each) for each in level):
-            raise ValueError("a number is too large")
-        if any(isinstance(each, int) and each.bit_length() > LONGEST_WHOLE for each in level):
-            raise ValueError("a number is too large")  # no float can be made of it
+        for each in level:
+            is_large = isinstance(each, int) and each.bit_length() > LONGEST_WHOLE  # no float can be made of it
+            if is_large or (isinstance(each, float) and not math.isfinite(each)):
+                raise ValueError("a number is too large")
         level = [
             inner
             for each in level
@@ -202,3 +201,103 @@ def remove_tree(path: Path) -> None:
     hidden = path.parent / f".{path.name.lstrip('.')}.{uuid.uuid4().hex[:8]}.trash"
     os.rename(path, hidden)
     shutil.rmtree(hidden, ignore_errors=True)
+
+
+_in_progress: set[Path] = set()
+
+
+@contextmanager
+def hidden_folder(path: Path, leftovers: Iterable[Path] = ()) -> Iterator[Path]:
+    """A new directory ``path``, with a hidden name, for content that :func:`publish` shows at once; deleted unless that has renamed it.
+
+    ``leftovers``: directories of the same owner; those that no other context of this process has are of killed processes, and are deleted.
+    """
+    _in_progress.add(path)
+    try:
+        for each in leftovers:
+            if each not in _in_progress and not each.parent.is_symlink():
+                shutil.rmtree(each, ignore_errors=True)
+        path.mkdir(parents=True)
+        yield path
+    finally:
+        shutil.rmtree(path, ignore_errors=True)
+        _in_progress.discard(path)
+
+
+def publish(hidden: Path, target: Path) -> None:
+    """:func:`rename_new`, durably."""
+    rename_new(hidden, target)
+    sync_directory(target.parent)
+
+
+def rename_new(hidden: Path, target: Path) -> None:
+    """Rename a finished directory to ``target``, which must not exist or be empty. Raises FileExistsError, OSError."""
+    try:
+        os.rename(hidden, target)
+    except OSError as error:
+        if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
+            raise FileExistsError(errno.EEXIST, "exists already", str(target)) from None
+        raise
+
+
+def copy_file(source: Path, target: Path) -> None:
+    """Copy a regular file durably. Raises as :func:`open_regular`; OSError if the volume is full or gone."""
+    with open_regular(source) as existing, open(target, "wb") as here:
+        shutil.copyfileobj(existing, here, 1 << 20)
+        here.flush()
+        os.fsync(here.fileno())
+
+
+def manifest_entry(path: Path) -> dict[str, Any]:
+    """Size and SHA-256 of a regular file, for a manifest. Raises as :func:`open_regular`."""
+    with open_regular(path) as file:
+        return {"size": os.fstat(file.fileno()).st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def read_manifest(
+    folder: Path,
+    names: re.Pattern[str],
+    newest: int,
+    damaged: Callable[[str], Exception],
+    newer: Callable[[str], Exception],
+) -> dict[str, Any]:
+    """The manifest of an immutable directory, whose files have these ``names``: none leads out of it.
+
+    Raises what ``damaged`` makes of the error's words; for a format after the ``newest``, what ``newer`` does.
+    """
+    try:
+        manifest = read_json(folder / MANIFEST)
+    except (OSError, ValueError) as error:
+        raise damaged(f"{MANIFEST} can't be read ({error})") from error
+    if manifest is None:
+        raise damaged(f"{MANIFEST} is missing")
+    number, files = manifest.get("format"), manifest.get("files")
+    if not isinstance(number, int):
+        raise damaged(f"{MANIFEST} has no format")
+    if number > newest:
+        raise newer(f"has format {number}, this Muster reads up to {newest}; upgrade Muster")
+    if not isinstance(files, dict):
+        raise damaged(f"{MANIFEST} lists no files")
+    for name, entry in files.items():
+        if not names.fullmatch(name) or name == MANIFEST:
+            raise damaged(f"{MANIFEST} names {name[:60]!r}, which is no file of it")
+        size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
+        if type(size) is not int or not 0 <= size < 2**63 or not isinstance(digest, str):
+            raise damaged(f"{MANIFEST} has no size and digest of {name}")
+    return manifest
+
+
+def difference_of(folder: Path, name: str, entry: Mapping[str, Any]) -> str:
+    """How a file differs from its entry in the manifest, as a clause; empty if it does not."""
+    try:
+        with open_regular(folder / name) as file:
+            if (size := os.fstat(file.fileno()).st_size) != entry["size"]:
+                return f"{name} has {size} bytes, {entry['size']} were written"
+            is_same = hashlib.file_digest(file, "sha256").hexdigest() == entry["sha256"]
+    except DamagedFile:
+        return f"{name} is not a regular file"
+    except FileNotFoundError:
+        return f"{name} is missing"
+    except OSError as error:
+        return f"{name} can't be read ({error.strerror})"
+    return "" if is_same else f"the content of {name} was altered (SHA-256 differs)"

@@ -9,18 +9,26 @@ A run that imitates a teacher holds a copy of the teacher's weights in the same 
 
 from __future__ import annotations
 
-import errno
 import os
 import shutil
 import threading
 import uuid
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, Self
 
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, checkpoint_called
-from shared_store.volume.files import DamagedFile, open_regular, sync_directory, write_json
+from shared_store.volume.files import (
+    MANIFEST,
+    DamagedFile,
+    copy_file,
+    difference_of,
+    hidden_folder,
+    rename_new,
+    sync_directory,
+    write_json,
+)
 from shared_store.volume.layout import Run, Store
 
 WEIGHTS = "learner.pt"
@@ -44,8 +52,6 @@ class WeightsCopy:
         source: Checkpoint with the weights.
     """
 
-    _in_progress: set[Path] = set()
-
     def __init__(self, store: Store, owner: str, source: Checkpoint) -> None:
         self._store, self._owner, self.source = store, owner, source
         self.job = str(uuid.uuid4())
@@ -53,6 +59,7 @@ class WeightsCopy:
         self.hidden = store.path / "runs" / f".{owner}.{self.job.replace('-', '')[:12]}.clone"
         self._published: Path | None = None
         self._using = threading.RLock()
+        self._folder = ExitStack()
 
     def __enter__(self) -> Self:
         return self
@@ -71,29 +78,23 @@ class WeightsCopy:
             OSError: The volume is full or gone.
         """
         with self._using:
-            self._copy(place)
-
-    def _copy(self, place: str) -> None:
-        manifest = self.source.manifest
-        if WEIGHTS not in manifest["files"]:
-            raise DamagedCheckpoint(f"checkpoint {self.source.name}: it has no {WEIGHTS}, and so no weights")
-        self._in_progress.add(self.hidden)
-        self._clear_leftovers()
-        target = self.hidden / place / self.source.name
-        target.mkdir(parents=True)
-        try:
-            with open_regular(self.source.path / WEIGHTS) as there, open(target / WEIGHTS, "wb") as here:
-                shutil.copyfileobj(there, here, 1 << 20)
-                here.flush()
-                os.fsync(here.fileno())
-        except DamagedFile:
-            raise DamagedCheckpoint(f"checkpoint {self.source.name}: {WEIGHTS} is not a regular file") from None
-        except (FileNotFoundError, NotADirectoryError):
-            raise DamagedCheckpoint(f"checkpoint {self.source.name}: {WEIGHTS} is missing") from None
-        write_json(target / "manifest.json", {**manifest, "files": {WEIGHTS: manifest["files"][WEIGHTS]}})
-        Checkpoint(target, self.source.iteration, self.source.epoch).verify()
-        for each in (target, target.parent, self.hidden):
-            sync_directory(each)
+            manifest = self.source.manifest
+            if WEIGHTS not in manifest["files"]:
+                raise DamagedCheckpoint(f"checkpoint {self.source.name}: it has no {WEIGHTS}, and so no weights")
+            leftovers = (self._store.path / "runs").glob(f".{self._owner}.*.clone")
+            self._folder.enter_context(hidden_folder(self.hidden, leftovers))
+            target = self.hidden / place / self.source.name
+            target.mkdir(parents=True)
+            entry = manifest["files"][WEIGHTS]
+            try:
+                copy_file(self.source.path / WEIGHTS, target / WEIGHTS)
+            except (DamagedFile, FileNotFoundError, NotADirectoryError):
+                why = difference_of(self.source.path, WEIGHTS, entry)
+                raise DamagedCheckpoint(f"checkpoint {self.source.name}: {why}") from None
+            write_json(target / MANIFEST, {**manifest, "files": {WEIGHTS: entry}})
+            Checkpoint(target, self.source.iteration, self.source.epoch).verify()
+            for each in (target, target.parent, self.hidden):
+                sync_directory(each)
 
     def discard(self) -> None:
         """Delete the unfinished copy."""
@@ -107,14 +108,7 @@ class WeightsCopy:
     def close(self) -> None:
         """End the copy: no part of it has a hidden name any more."""
         with self._using:
-            shutil.rmtree(self.hidden, ignore_errors=True)
-            self._in_progress.discard(self.hidden)
-
-    def _clear_leftovers(self) -> None:
-        with suppress(OSError):
-            for path in (self._store.path / "runs").glob(f".{self._owner}.*.clone"):
-                if path not in self._in_progress:
-                    shutil.rmtree(path, ignore_errors=True)
+            self._folder.close()
 
 
 class NewRun(WeightsCopy):
@@ -143,11 +137,9 @@ class NewRun(WeightsCopy):
             if os.path.lexists(run.path):
                 raise RunExists
             try:
-                os.rename(self.hidden, run.path)
-            except OSError as error:
-                if error.errno in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR):
-                    raise RunExists from None  # another controller was faster
-                raise
+                rename_new(self.hidden, run.path)
+            except FileExistsError:
+                raise RunExists from None  # another controller was faster
             self._published = run.path
             sync_directory(run.path.parent)
         return run
@@ -163,9 +155,9 @@ class TeacherCopy(WeightsCopy):
     def publish(self, run: Path) -> None:
         """Move it to the run in directory ``run``, by one rename. Raises DamagedFile, OSError."""
         with self._using:
-            there = Run(run)
-            there.check_links()
-            place = there.teacher(self.teacher).checkpoints
+            existing = Run(run)
+            existing.check_links()
+            place = existing.teacher(self.teacher).checkpoints
             target = place / self.source.name
             if not target.exists():
                 place.mkdir(parents=True, exist_ok=True)

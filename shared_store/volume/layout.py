@@ -7,13 +7,14 @@ import os
 import re
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from shared_store.contract.plugins import plugins
-from shared_store.volume.files import DamagedFile, read_json, refuse_links, write_json
+from shared_store.contract.plugins import OF_RUN, plugins
+from shared_store.volume.files import DamagedFile, path_exists, read_json, refuse_links, write_json
 
 FORMAT = 1
 """Version of the layout; a store with a newer one is refused."""
@@ -32,63 +33,43 @@ class StoreError(Exception):
     """The store can't be used; the message names the path, the reason and the remedy."""
 
 
+class _Part:
+    """The path in a run that has the name of the attribute."""
+
+    def __init__(self, suffix: str = "") -> None:
+        self._suffix = suffix
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name + self._suffix
+
+    def __get__(self, run: Run, owner: type) -> Path:
+        return run.path / self._name
+
+
 @dataclass(frozen=True)
 class Run:
     """One training history, continued by one or more jobs. It has paths only, and creates nothing on access."""
 
     path: Path
+    checkpoints = _Part()
+    contract = _Part(".json")
+    metrics = _Part()
+    parent = _Part()
+    evaluations = _Part()
+    incidents = _Part()
+    exports = _Part()
+    recordings = _Part()
+    telemetry = _Part()
+    tracking = _Part()
+    texts = _Part()
 
     @property
     def name(self) -> str:
         return self.path.name
 
-    @property
-    def checkpoints(self) -> Path:
-        return self.path / "checkpoints"
-
-    @property
-    def contract(self) -> Path:
-        return self.path / "contract.json"
-
-    @property
-    def metrics(self) -> Path:
-        return self.path / "metrics"
-
-    @property
-    def parent(self) -> Path:
-        return self.path / "parent"
-
     def teacher(self, name: str) -> Run:
         """The copy of the weights of run ``name``, the teacher of this run's policy, in the layout of a run."""
         return Run(self.path / "teachers" / name)
-
-    @property
-    def evaluations(self) -> Path:
-        return self.path / "evaluations"
-
-    @property
-    def incidents(self) -> Path:
-        return self.path / "incidents"
-
-    @property
-    def exports(self) -> Path:
-        return self.path / "exports"
-
-    @property
-    def recordings(self) -> Path:
-        return self.path / "recordings"
-
-    @property
-    def telemetry(self) -> Path:
-        return self.path / "telemetry"
-
-    @property
-    def tracking(self) -> Path:
-        return self.path / "tracking"
-
-    @property
-    def texts(self) -> Path:
-        return self.path / "texts"
 
     def logs(self, job: str, attempt: int) -> Path:
         return self.path / "logs" / job / str(attempt)
@@ -101,21 +82,7 @@ class Run:
 
     def check_links(self) -> None:
         """Raise DamagedFile if the run, or a directory of it that Muster uses, is a link, which leads out of the store."""
-        for name in (
-            "checkpoints",
-            "metrics",
-            "evaluations",
-            "exports",
-            "recordings",
-            "telemetry",
-            "tracking",
-            "texts",
-            "logs",
-            "outcomes",
-            "parent",
-            "teachers",
-            *(name for plugin in plugins().values() for name in plugin.run_folders),
-        ):
+        for name in sorted(OF_RUN.union(*(plugin.run_folders for plugin in plugins().values()))):
             refuse_links(self.path / name, 2)
 
     def description(self) -> dict[str, Any] | None:
@@ -126,31 +93,36 @@ class Run:
         self.check_links()
         path = self.path / "run.json"
         found = read_json(path, LARGEST_DESCRIPTION)
-        if found is not None and not isinstance(found.get("spec"), dict | None):
-            raise DamagedFile(f"{path}: spec is not a mapping")
-        if found is not None and not isinstance(found.get("created"), int | float | None):
-            raise DamagedFile(f"{path}: created is not a number")
-        if found is not None and not 0 <= (found.get("created") or 0) < 2**53:  # no database holds more
-            raise DamagedFile(f"{path}: created is no time")
-        if found is not None and not isinstance(found.get("parent"), dict | None):
-            raise DamagedFile(f"{path}: parent is not a mapping")
+        if found is None:
+            return None
+        kinds = {"spec": (dict, "a mapping"), "created": (int | float, "a number"), "parent": (dict, "a mapping")}
+        for key, (kind, words) in kinds.items():
+            if not isinstance(found.get(key), kind | None):
+                raise DamagedFile(f"{path}: {key} is not {words}")
+        if not 0 <= (found.get("created") or 0) < 2**53:  # no database holds more
+            raise DamagedFile(f"{path}: created is not a time")
         return found
 
     def is_missing(self) -> bool:
         """Whether the store can be read and lacks the run; False if that is uncertain, for example while the volume is away."""
         try:
-            os.lstat(self.path / "run.json")
-        except FileNotFoundError:
-            return os.path.lexists(self.path.parent.parent / "store.json")
+            return not path_exists(self.path / "run.json") and os.path.lexists(self.path.parent.parent / "store.json")
         except OSError:
             return False
-        return False
 
     def create(self, description: dict[str, Any]) -> None:
         """Write ``run.json`` once; an existing run keeps its own. Raises as :meth:`check_links`, OSError."""
         self.check_links()
         if not (self.path / "run.json").exists():
             write_json(self.path / "run.json", description)
+
+
+def check_name(what: str, name: str, error: Callable[[str], Exception]) -> None:
+    """Raise what ``error`` makes of one line for an invalid name of a run, model or the like: a name becomes a directory."""
+    if not NAME.fullmatch(name):
+        raise error(
+            f"{what} name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
+        )
 
 
 @dataclass(frozen=True)
@@ -184,11 +156,8 @@ class Store:
 
     def check_owner(self) -> None:
         """Raises StoreError where the owner of the store's directory can't write in directories that this user makes there."""
-        probe = self.path / "runs" / f".probe-{os.getpid()}"
         try:
-            probe.mkdir()
-            made, owner = probe.stat(), self.path.stat()
-            probe.rmdir()
+            made, owner = self._probe(), self.path.stat()
         except OSError as error:
             raise self._not_writable(error.strerror or str(error)) from error
         bit = 0o200 if made.st_uid == owner.st_uid else 0o020 if made.st_gid == owner.st_gid else 0o002
@@ -197,6 +166,14 @@ class Store:
                 f"store {self.path}: it belongs to user {owner.st_uid}, as whom containers run, and they can't write what this "
                 f"controller makes there as user {made.st_uid}; chown the store, or start muster serve as user {owner.st_uid}"
             )
+
+    def _probe(self) -> os.stat_result:
+        """Of a directory that this user has made and removed. Raises OSError."""
+        probe = self.path / "runs" / f".probe-{os.getpid()}"
+        probe.mkdir()
+        made = probe.stat()
+        probe.rmdir()
+        return made
 
     def _not_writable(self, why: str) -> StoreError:
         return StoreError(
@@ -213,9 +190,7 @@ class Store:
             description = read_json(self.path / "store.json")
             if description is None or (description.get("format") == FORMAT and not description.get("id")):
                 description = self._name(description or {"format": FORMAT})
-            probe = self.path / "runs" / f".probe-{os.getpid()}"
-            probe.write_bytes(b"")
-            probe.unlink()
+            self._probe()
         except OSError as error:
             raise self._not_writable(error.strerror or str(error)) from error
         except ValueError as error:
@@ -231,13 +206,10 @@ class Store:
         import secrets  # every command imports this module, and few need them
 
         claim = self.path / ".naming"
-        try:
-            with open(claim, "xb") as file:
-                file.write(secrets.token_hex(16).encode())
-                file.flush()
-                os.fsync(file.fileno())
-        except FileExistsError:
-            pass
+        with suppress(FileExistsError), open(claim, "xb") as file:
+            file.write(secrets.token_hex(16).encode())
+            file.flush()
+            os.fsync(file.fileno())
         for _ in range(_NAMING_TRIES):
             if named := claim.read_bytes().decode():
                 break
@@ -250,8 +222,7 @@ class Store:
 
     def run(self, name: str) -> Run:
         """The run called ``name``, whether it exists or not. Raises StoreError for a name that can't be a directory."""
-        if not NAME.fullmatch(name):
-            raise StoreError(f"run name {name!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them")
+        check_name("run", name, StoreError)
         return Run(self.path / "runs" / name)
 
     @property
@@ -267,10 +238,10 @@ class Store:
     ) -> list[Run]:
         """The existing runs, by name: those after ``after``, at most ``most``, of which ``among`` is true."""
         try:
-            entries = sorted(entry.name for entry in os.scandir(self.path / "runs") if entry.name > after)
+            entries = sorted(name for name in os.listdir(self.path / "runs") if name > after and NAME.fullmatch(name))
         except FileNotFoundError:
             return []
-        named = (self.run(name) for name in entries if NAME.fullmatch(name))
+        named = map(self.run, entries)
         return list(islice((run for run in named if os.path.lexists(run.path / "run.json") and among(run)), most))
 
 

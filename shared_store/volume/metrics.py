@@ -12,14 +12,13 @@ import os
 import re
 import threading
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import FileIO
-from itertools import islice, takewhile
+from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from shared_store.volume.files import DamagedFile, json_object, open_regular
@@ -88,9 +87,7 @@ class MetricsWriter:
     def __enter__(self) -> MetricsWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
 
@@ -233,8 +230,8 @@ class _File:
                 section.marks.append((iteration, start))
             section.last, section.end = iteration, self.end
 
-    def read(self, section: _Section, after: int) -> Iterator[tuple[int, dict[str, Any]]]:
-        """The section's records from the last mark before ``after`` on, by iteration."""
+    def read(self, section: _Section, after: int, up_to: float) -> Iterator[tuple[int, dict[str, Any]]]:
+        """The section's records from the last mark before ``after`` on, by iteration, up to that of ``up_to``."""
         place = max(0, bisect_right(section.marks, after, key=lambda mark: mark[0]) - 1)
         with open_regular(self.path) as file:
             position = file.seek(section.marks[place][1])
@@ -242,11 +239,9 @@ class _File:
                 position += len(line)
                 record = _record(line)
                 if isinstance(iteration := record.get("iteration"), int):
+                    if iteration > up_to:
+                        return
                     yield iteration, record
-
-
-def _until(limit: float, records: Iterable[tuple[int, dict[str, Any]]]) -> Iterator[tuple[int, dict[str, Any]]]:
-    return takewhile(lambda each: each[0] <= limit, records)
 
 
 class MetricsHistory:
@@ -269,9 +264,11 @@ class MetricsHistory:
             limit: float = math.inf
             for file, section in reversed(self._refresh()):
                 if section.marks and min(section.last, limit) > iteration:
-                    wanted = (each for each in file.read(section, iteration) if each[0] > iteration)
-                    found = dict(islice(_until(limit, wanted), most)) | found  # the later section counts
-                limit = limit if section.resumed_from is None else min(limit, section.resumed_from)
+                    records = file.read(section, iteration, limit)
+                    later = (each for each in records if each[0] > iteration)
+                    found = dict(islice(later, most)) | found  # the later section counts
+                if section.resumed_from is not None:
+                    limit = min(limit, section.resumed_from)
         return [found[i] for i in sorted(found)[:most]]
 
     def last(self) -> dict[str, Any] | None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import shutil
 import time
 import uuid
 from collections.abc import Callable, Mapping, Sequence
@@ -24,8 +23,8 @@ from shared_store.volume import bundles
 from shared_store.volume.bundles import DamagedBundle
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.evaluations import list_evaluations
-from shared_store.volume.files import read_json, refuse_links, write_json
-from shared_store.volume.layout import NAME, Run, Store
+from shared_store.volume.files import hidden_folder, read_json, refuse_links, write_json
+from shared_store.volume.layout import Run, Store, check_name, names_in
 
 _VERSION = re.compile(r"[1-9][0-9]{0,8}")
 
@@ -62,13 +61,7 @@ class Model:
 
     def facts(self) -> dict[str, Any]:
         """The content of ``model.json``. Raises DamagedBundle."""
-        try:
-            found = read_json(self.path / "model.json")
-        except (OSError, ValueError) as error:
-            raise DamagedBundle(f"model {self.reference}: model.json can't be read ({error})") from error
-        if found is None:
-            raise DamagedBundle(f"model {self.reference}: model.json is missing")
-        return found
+        return bundles.read_document(self.path, "model.json", f"model {self.reference}")
 
     def contract(self) -> Contract:
         """The contract of its policy. Raises DamagedBundle."""
@@ -80,40 +73,23 @@ class Model:
         bundles.verify(self.bundle)
 
 
-def check_name(name: str) -> None:
-    """Raise ModelError for an invalid name of a model: a name becomes a directory."""
-    if not NAME.fullmatch(name):
-        raise ModelError(
-            f"model name {name[:130]!r}: use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit"
-        )
-
-
 def model_names(store: Store) -> list[str]:
     """Names of all models that have a version."""
-    try:
-        names = sorted(entry.name for entry in os.scandir(store.models) if NAME.fullmatch(entry.name))
-    except FileNotFoundError:
-        return []
-    return [name for name in names if versions(store, name)]
+    return [name for name in names_in(store.models) if versions(store, name)]
 
 
 def versions(store: Store, name: str) -> list[Model]:
     """The versions of a model, the newest last. Raises ModelError for an invalid name, DamagedFile for a link."""
-    check_name(name)
+    check_name("model", name, ModelError)
     folder = store.models / name
     refuse_links(folder, 2)
-    try:
-        entries = os.listdir(folder)
-    except (FileNotFoundError, NotADirectoryError):
-        return []
+    entries = os.listdir(folder) if folder.is_dir() else ()
     return [Model(folder / str(n), name, n) for n in sorted(int(each) for each in entries if _VERSION.fullmatch(each))]
 
 
-def _all(_: Model) -> bool:
-    return True
-
-
-def find(store: Store, name: str, version: int | None = None, visible: Callable[[Model], bool] = _all) -> Model:
+def find(
+    store: Store, name: str, version: int | None = None, visible: Callable[[Model], bool] = lambda model: True
+) -> Model:
     """A version of a model, by default the newest. Raises UnknownModel with the nearest name, or the existing versions.
 
     ``visible``: whether the caller may see the model with this newest version; others are as if they did not exist.
@@ -125,15 +101,10 @@ def find(store: Store, name: str, version: int | None = None, visible: Callable[
         raise UnknownModel(f"model {name} does not exist; {hint}")
     if version is None:
         return found[-1]
-    for model in found:
-        if model.version == version:
-            return model
-    there = ", ".join(str(model.version) for model in found)
-    raise UnknownModel(f"model {name} has no version {version}; there are: {there}")
-
-
-_in_progress: set[Path] = set()
-"""Hidden directories of this process's current registrations."""
+    if model := next((model for model in found if model.version == version), None):
+        return model
+    existing = ", ".join(str(model.version) for model in found)
+    raise UnknownModel(f"model {name} has no version {version}; there are: {existing}")
 
 
 def register(
@@ -166,7 +137,7 @@ def register(
         OSError, DamagedFile: The volume is full or gone, or has a link in place of a directory.
     """
     bundle = run.exports / checkpoint.name
-    check_name(name)
+    check_name("model", name, ModelError)
     refuse_links(bundle, 2)
     if not bundle.is_dir():
         reference = f"{run.name}@{checkpoint.iteration}"
@@ -175,21 +146,18 @@ def register(
         )
     folder = store.models / name
     refuse_links(folder, 2)
-    folder.mkdir(parents=True, exist_ok=True)
     hidden = folder / f".{registrar}.{uuid.uuid4().hex}.tmp"
-    _in_progress.add(hidden)
-    try:
-        _clear_leftovers(store, registrar)
-        hidden.mkdir()
+    with hidden_folder(hidden, store.models.glob(f"*/.{registrar}.*.tmp") if registrar else ()):
+        (hidden / "bundle").mkdir()
         bundles.copy_files(bundle, hidden / "bundle")
         lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))
         while True:
-            there = versions(store, name)
-            if not again and (same := _version_of(there, lineage)) is not None:
+            existing = versions(store, name)
+            if not again and (same := _version_of(existing, lineage)) is not None:
                 raise AlreadyRegistered(
                     f"the same checkpoint is {same.reference} already; --again registers it once more"
                 )
-            version = there[-1].version + 1 if there else 1
+            version = existing[-1].version + 1 if existing else 1
             model = Model(folder / str(version), name, version)
             write_json(hidden / "model.json", {**facts, **lineage, "name": name, "version": version})
             (hidden / bundles.MANIFEST).unlink(missing_ok=True)
@@ -201,26 +169,16 @@ def register(
             with contextlib.suppress(FileExistsError):
                 bundles.publish(hidden, model.path)
                 return model
-    finally:
-        shutil.rmtree(hidden, ignore_errors=True)
-        _in_progress.discard(hidden)
 
 
-def _version_of(there: Sequence[Model], lineage: Mapping[str, Any]) -> Model | None:
+def _version_of(existing: Sequence[Model], lineage: Mapping[str, Any]) -> Model | None:
     """The newest version of the same checkpoint, compared by its files, since an earlier run may have had the same name."""
-    for model in reversed(there):
+    for model in reversed(existing):
         with contextlib.suppress(DamagedBundle):
             facts = model.facts()
             if all(facts.get(key) == lineage[key] for key in ("run", "checkpoint", "checkpoint_files")):
                 return model
     return None
-
-
-def _clear_leftovers(store: Store, registrar: str) -> None:
-    """Delete the leftovers of this controller's killed registrations, for any model; those of other controllers may still be running."""
-    for path in store.models.glob(f"*/.{registrar}.*.tmp") if registrar else ():
-        if path not in _in_progress and not path.parent.is_symlink():
-            shutil.rmtree(path, ignore_errors=True)
 
 
 def _lineage(run: Run, checkpoint: Checkpoint, manifest: Mapping[str, Any]) -> dict[str, Any]:

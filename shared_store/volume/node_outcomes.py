@@ -9,7 +9,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from shared_store.contract.faults import Fault, fault_from
+from shared_store.contract.documents import DocumentError, parse
+from shared_store.contract.faults import Fault
 from shared_store.volume.files import read_json, refuse_links, write_json
 from shared_store.volume.layout import Run
 
@@ -18,7 +19,6 @@ LONGEST_TEXT = 16 << 10
 write the file itself."""
 _LATEST = 2.0**40
 """Upper limit of Unix times [s] in an outcome."""
-_NUMBER = int | float
 _LEVELS = 4
 """Directories from that of an outcome up to its run: ``<run>/outcomes/<job>/<attempt>``."""
 OUT_OF_MEMORY = "OutOfMemoryError: Container killed due to memory usage"
@@ -87,28 +87,22 @@ def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
     try:
         path = run.outcome(job, attempt, node)
         refuse_links(path.parent, _LEVELS)
-        value: dict[str, Any] | None = read_json(path)
+        value = read_json(path)
         return None if value is None else parse_outcome(value)
-    except (ValueError, TypeError):
+    except ValueError:
         return None
 
 
 def parse_outcome(value: dict[str, Any]) -> Outcome:
-    """The outcome from its ``asdict`` form, with bounded texts. Raises TypeError if it is damaged."""
-    error = None
-    if value.get("error"):
-        error = FirstError(**value["error"])
-        error = replace(error, fault=fault_from(error.fault))
-    outcome = Outcome(**{**value, "error": error})
-    _check(outcome, node=int, epoch=int, exit_code=int, signal=str | None, reason=str, started=_NUMBER, ended=_NUMBER)
-    if not isinstance(outcome.asked, bool) or not isinstance(outcome.cannot_start, bool):
-        raise TypeError("asked or cannot_start is of the wrong type")
+    """The outcome from its ``asdict`` form, with bounded texts. Raises ValueError if it is damaged."""
+    outcome: Outcome = parse(Outcome, {**value, "error": value.get("error") or None}, "outcome")
+    error = outcome.error
+    times = (outcome.started, outcome.ended, error.time if error else 0)
+    numbers = (outcome.node, outcome.epoch, error.rank if error else 0)
+    if not all(0 <= each < _LATEST for each in times) or not all(abs(each) < 2**63 for each in numbers):
+        raise DocumentError("outcome: a time or a number is out of range")
     if not 0 <= outcome.exit_code <= 255:
-        raise TypeError("exit_code is not one of a process")
-    if error is not None:
-        _check(error, rank=int, message=str, traceback=str, time=_NUMBER)
-    if not all(0 <= time < _LATEST for time in (outcome.started, outcome.ended, error.time if error else 0)):
-        raise TypeError("a time is out of range")
+        raise DocumentError("outcome: exit_code is not one of a process")
     return bounded(outcome)
 
 
@@ -127,10 +121,3 @@ def _cut(text: str, keep_end: bool = False) -> str:
     note = f"({len(text) - LONGEST_TEXT + 64} characters left out)"
     kept = LONGEST_TEXT - 64
     return f"{note} …\n{text[-kept:]}" if keep_end else f"{text[:kept]} … {note}"
-
-
-def _check(value: object, **kinds: Any) -> None:
-    for name, kind in kinds.items():
-        found = getattr(value, name)
-        if not isinstance(found, kind) or isinstance(found, bool) or (isinstance(found, int) and abs(found) >= 2**63):
-            raise TypeError(f"{name} is of the wrong type or too large")

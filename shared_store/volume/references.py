@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
-from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from shared_store.contract.plugins import PluginError, failed, load, plugins
 from shared_store.volume import models
 from shared_store.volume.bundles import DamagedBundle
-from shared_store.volume.files import DamagedFile, is_there, read_json
-from shared_store.volume.layout import LARGEST_DESCRIPTION, Store, names_in
+from shared_store.volume.files import DamagedFile, path_exists, read_json
+from shared_store.volume.layout import LARGEST_DESCRIPTION, Run, Store, names_in
 from shared_store.volume.models import Model, ModelError
 from shared_store.volume.plugin_folders import orphans
 
@@ -40,10 +38,12 @@ _READING = (DamagedBundle, DamagedFile, ModelError, OSError)
 
 def references(store: Store) -> tuple[list[Needed], list[Unreadable]]:
     """All that in the store needs a run or a job, and what could not be read."""
-    found = [each for what, referrer in _OWN for each in read(what, referrer, store)]
-    for what, referrer in _of_plugins():
-        of_plugin = read(what, referrer, store)
-        found += [each if isinstance(each, Needed) else each._replace(whole=True) for each in of_plugin]
+    found = [*read("models", _of_models, store), *read("runs", _of_runs, store)]
+    of_plugins = [*read("plugins.json", lambda: map(Unreadable, orphans(store)))]
+    for name, plugin in plugins().items():
+        if plugin.references:
+            of_plugins += read(f"plug-in {name}", _of_plugin, plugin.references, store)
+    found += [each._replace(whole=True) if isinstance(each, Unreadable) else each for each in of_plugins]
     needed = [each for each in found if isinstance(each, Needed)]
     return needed, [each for each in found if isinstance(each, Unreadable)]
 
@@ -52,9 +52,7 @@ def read(what: str, referrer: Callable[..., Found], *arguments: Any) -> Found:
     """What a function finds, with what it can't read: ``what`` names that, such as ``model ant``."""
     try:
         yield from referrer(*arguments)
-    except DamagedBundle as error:  # which names the model
-        yield Unreadable(str(error))
-    except PluginError as error:  # which names the plug-in
+    except (DamagedBundle, PluginError) as error:  # which names the model, or the plug-in
         yield Unreadable(str(error))
     except _READING as error:
         yield Unreadable(f"{what} can't be read ({error})")
@@ -80,30 +78,16 @@ def _of_model(model: Model) -> Found:
 def _of_runs(store: Store) -> Found:
     """Runs that began with the weights of another, and those that hold the weights of a teacher."""
     for name in names_in(store.path / "runs"):
-        yield from read(f"run {name}", _of_run, name, store.path / "runs" / name)
+        yield from read(f"run {name}", _of_run, store.run(name))
 
 
-def _of_run(name: str, path: Path) -> Found:
-    if is_there(path / "parent"):
-        described = read_json(path / "run.json", LARGEST_DESCRIPTION) or {}
-        yield from needed_run(part(described.get("parent"), "run"), f"run {name} is a clone of it")
-    if is_there(path / "teachers"):
-        for teacher in names_in(path / "teachers"):
-            yield from needed_run(teacher, f"it is the teacher of run {name}")
-
-
-_OWN = (("models", _of_models), ("runs", _of_runs))
-
-
-def _of_orphans(store: Store) -> Found:
-    yield from (Unreadable(str(each)) for each in orphans(store))
-
-
-def _of_plugins() -> Iterator[tuple[str, Callable[[Store], Found]]]:
-    yield "plugins.json", _of_orphans
-    for name, plugin in plugins().items():
-        if plugin.references:
-            yield f"plug-in {name}", partial(_of_plugin, plugin.references)
+def _of_run(run: Run) -> Found:
+    if path_exists(run.parent):
+        described = read_json(run.path / "run.json", LARGEST_DESCRIPTION) or {}
+        yield from needed_run(part(described.get("parent"), "run"), f"run {run.name} is a clone of it")
+    if path_exists(run.path / "teachers"):
+        for teacher in names_in(run.path / "teachers"):
+            yield from needed_run(teacher, f"it is the teacher of run {run.name}")
 
 
 def _of_plugin(place: str, store: Store) -> Found:

@@ -12,6 +12,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,12 +61,7 @@ def size_in_definition(value: Any) -> int:
 
 def references(spec: Mapping[str, Any] | None) -> list[Reference]:
     """The texts that a job's spec names by their digests."""
-    return [
-        Reference(f"{section}.config.{field}", value.get("file", field), value["sha256"])
-        for section in ("train", *evaluating())
-        for field, value in _config(spec, section)
-        if is_reference(value)
-    ]
+    return [_reference(*entry) for entry in _entries(spec) if is_reference(entry[2])]
 
 
 def beside(spec: Mapping[str, Any]) -> tuple[dict[str, Any], dict[Reference, str]]:
@@ -73,26 +69,21 @@ def beside(spec: Mapping[str, Any]) -> tuple[dict[str, Any], dict[Reference, str
     result, texts = dict(spec), dict[Reference, str]()
     found = [
         (size_in_definition(value), section, field, value)
-        for section in ("train", *evaluating())
-        for field, value in _config(spec, section)
+        for section, field, value in _entries(spec)
         if isinstance(value, Mapping) and value.keys() <= {"file", "text"} and isinstance(value.get("text"), str)
     ]
     for size, section, field, value in sorted(found, key=lambda each: each[0], reverse=True):
         if size <= _OF_REFERENCE or _HALF.search(value["text"]):
             continue
-        if _size_of(result) <= IN_DEFINITION:
+        again = {
+            key: spec[key] for key in ("environment", "secrets", "command") if key in spec
+        }  # as the definition has them
+        if size_in_definition(result) + len(json.dumps(again)) <= IN_DEFINITION:
             break
-        reference = Reference(f"{section}.config.{field}", str(value.get("file") or field), digest_of(value["text"]))
-        kept = {"file": reference.file, "sha256": reference.sha256}
+        kept = {"file": str(value.get("file") or field), "sha256": digest_of(value["text"])}
         result[section] = {**result[section], "config": {**result[section]["config"], field: kept}}
-        texts[reference] = value["text"]
+        texts[_reference(section, field, kept)] = value["text"]
     return result, texts
-
-
-def _size_of(spec: Mapping[str, Any]) -> int:
-    """Bytes of a definition that depend on its spec: that itself, and what the definition has of it once more."""
-    again = {key: spec[key] for key in ("environment", "secrets", "command") if key in spec}
-    return size_in_definition(spec) + len(json.dumps(again))
 
 
 def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str, Any]:
@@ -107,28 +98,24 @@ def resolved(config: Mapping[str, Any], directory: Path, where: str) -> dict[str
         TextError: A text is missing or altered.
         OSError: The volume can't be read.
     """
-    result = dict(config)
-    for field, value in config.items():
-        if is_reference(value):
-            name = value.get("file", field)
-            text = read(directory, Reference(f"{where}.{field}", name, value["sha256"]))
-            result[field] = {"file": name, "text": text}
-    return result
+    return {field: _resolved(value, directory, f"{where}.{field}") for field, value in config.items()}
+
+
+def _resolved(value: Any, directory: Path, key: str) -> Any:
+    if not is_reference(value):
+        return value
+    name = value.get("file", key.rpartition(".")[2])
+    return {"file": name, "text": read(directory, Reference(key, name, value["sha256"]))}
 
 
 def resolved_spec(spec: Mapping[str, Any], *directories: Path) -> dict[str, Any]:
     """A job's spec with the texts in the place of their references, to be shown: a text that none of the directories has is left out."""
     result = dict(spec)
-    for section in ("train", *evaluating()):
-        config = dict(_config(spec, section))
+    for section, field, value in _entries(spec):
         for directory in directories:
-            for field, value in config.items():
-                try:
-                    config |= resolved({field: value}, directory, f"{section}.config")
-                except (TextError, OSError):
-                    continue
-        if config:
-            result[section] = {**result[section], "config": config}
+            with suppress(TextError, OSError):
+                value = _resolved(value, directory, f"{section}.config.{field}")
+        result[section] = {**result[section], "config": {**result[section]["config"], field: value}}
     return result
 
 
@@ -168,10 +155,16 @@ def _lost(reference: Reference, path: Path, why: str) -> TextError:
     return TextError(f"{reference}: the text kept at {path} is {why}; submit the job again with the file")
 
 
-def _config(spec: Mapping[str, Any] | None, section: str) -> Iterator[tuple[str, Any]]:
-    values = (spec or {}).get(section)
-    config = values.get("config") if isinstance(values, Mapping) else None
-    return iter(config.items() if isinstance(config, Mapping) else ())
+def _entries(spec: Mapping[str, Any] | None) -> Iterator[tuple[str, str, Any]]:
+    """Section, field and value of all entries of the tasks' configurations in a spec."""
+    for section in ("train", *evaluating()):
+        values = (spec or {}).get(section)
+        config = values.get("config") if isinstance(values, Mapping) else None
+        yield from ((section, field, value) for field, value in (config.items() if isinstance(config, Mapping) else ()))
+
+
+def _reference(section: str, field: str, value: Mapping[str, Any]) -> Reference:
+    return Reference(f"{section}.config.{field}", value.get("file", field), value["sha256"])
 
 
 def is_file(value: Any) -> bool:

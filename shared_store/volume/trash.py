@@ -44,9 +44,9 @@ def throw_away(store: Store, paths: Iterable[Path]) -> tuple[list[Path], dict[Pa
     try:
         for path in paths:
             refuse_links(path, len(path.relative_to(store.path).parts))
-            there = trash / f"{uuid.uuid4().hex}.{path.name[:100]}"
+            existing = trash / f"{uuid.uuid4().hex}.{path.name[:100]}"
             try:
-                os.rename(path, there)
+                os.rename(path, existing)
             except FileNotFoundError:
                 continue
             except OSError as error:
@@ -54,7 +54,7 @@ def throw_away(store: Store, paths: Iterable[Path]) -> tuple[list[Path], dict[Pa
                     raise
                 kept[path] = error
             else:
-                thrown.append(there)
+                thrown.append(existing)
                 changed.add(path.parent)
     finally:
         for each in changed:

@@ -57,7 +57,7 @@ class RankPlacement:
             value = env.get(name) or str(default)
             if not value.isdecimal():
                 raise ValueError(
-                    f"{name} is {value!r}, not a whole number; ranks are started by worker.supervisor or by torchrun"
+                    f"{name} is {value!r}, not an integer; ranks are started by worker.supervisor or by torchrun"
                 )
             return int(value)
 

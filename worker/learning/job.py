@@ -141,7 +141,7 @@ class Job:
         """The whole number ``name`` of the section. Raises UserError for anything else."""
         value = self.section.get(name, default)
         if not isinstance(value, int) or isinstance(value, bool) or value < least:
-            raise UserError(f"{name}: expected a whole number of at least {least}, got {value!r}")
+            raise UserError(f"{name}: expected an integer of at least {least}, got {value!r}")
         return value
 
 
@@ -151,11 +151,11 @@ def _check_kinds(spec: Mapping[str, Any], kind: str) -> None:
 
     section = spec[kind]
     if not isinstance(algorithm := section.get("algorithm", ""), str):
-        raise UserError(f"{kind}.algorithm: expected a text, found {kind_of(algorithm)}")
+        raise UserError(f"{kind}.algorithm: expected a string, found {kind_of(algorithm)}")
     places = {f"{kind}.{name}": section.get(name) for name in ("config", "settings", *sorted(training_sections()))}
     for where, found in {**places, "checkpoint": spec.get("checkpoint")}.items():
         if not isinstance(found, dict | None):
-            raise UserError(f"{where}: expected a mapping, found {kind_of(found)}")
+            raise UserError(f"{where}: expected an object, found {kind_of(found)}")
 
 
 def with_texts(section: Mapping[str, Any], run: Run, kind: str) -> dict[str, Any]:

@@ -107,7 +107,7 @@ def class_of(section: Mapping[str, Any]) -> str | None:
     """``PPO`` or ``Distillation`` if an ``algorithm`` section names rsl_rl's own class; None for another class."""
     name = section.get("class_name", "PPO")
     if not isinstance(name, str):
-        raise Refused(("class_name",), f"expected a text, found {shown(name)}")
+        raise Refused(("class_name",), f"expected a string, found {shown(name)}")
     module, _, last = name.replace(":", ".").rpartition(".")
     return last if last in _SECTIONS and (not module or module.partition(".")[0] == "rsl_rl") else None
 

@@ -39,7 +39,7 @@ class Tracking:
         if not is_main or not services:
             return
         if not isinstance(services, dict) or not all(isinstance(each, dict | None) for each in services.values()):
-            raise UserError("track: expected a mapping of services, such as {wandb: {project: ant}}")
+            raise UserError("track: expected an object of services, such as {wandb: {project: ant}}")
         from worker.telemetry.services import SERVICES
 
         for name, settings in services.items():

@@ -121,7 +121,7 @@ def _directives(gang: Gang, output: str) -> dict[str, str]:
         try:  # users may only lower the priority of a job: the job's own is taken off the base
             found["--nice"] = str(max(0, int(base) - gang.priority))
         except ValueError:
-            raise EngineError(f"muster:nice is {base!r}, not a whole number") from None
+            raise EngineError(f"muster:nice is {base!r}, not an integer") from None
     return found | {
         "--signal": f"B:USR1@{math.ceil(notice)}",
         "--open-mode": "append",

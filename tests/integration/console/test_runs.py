@@ -172,7 +172,7 @@ def test_a_damaged_run_says_so_and_takes_no_other_away(console: Console, store: 
     (run.path / "run.json").write_text("{")
     trained(store, "odd-age", [1.0], created=1e300)
     page = console.visitor().page("/runs?search=a")
-    assert "damaged" in names(page) and "fast" in names(page) and "created is no time" in page.text
+    assert "damaged" in names(page) and "fast" in names(page) and "created is not a time" in page.text
     assert "damaged file" in console.visitor().page("/runs/damaged", 409).text
 
 

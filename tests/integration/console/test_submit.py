@@ -73,11 +73,11 @@ def test_a_form_that_is_sent_again_leads_to_the_job_that_it_made(console: Consol
 @pytest.mark.parametrize(
     ("field", "value", "words"),
     [
-        ("train.worlds", "many", "expected a whole number"),
+        ("train.worlds", "many", "expected an integer"),
         ("train.config.rewards.alive", "[1]", "found"),
         ("train.ppo.gamma", "7", "7"),
         ("name", "a b", "expected letters"),
-        ("nodes", "x", "expected a whole number of nodes"),
+        ("nodes", "x", "expected an integer number of nodes"),
         ("timeout", "soon", "expected a duration"),
     ],
 )
@@ -145,7 +145,7 @@ def test_any_job_is_submitted_as_yaml_with_help_for_the_line_and_its_errors_mark
     [
         ("name: [", "not valid YAML", 1),
         ("a: &x 1\nb: *x\n", "anchors and aliases", 1),
-        ("", "expected a mapping", 0),
+        ("", "expected an object", 0),
     ],
 )
 def test_what_a_request_must_not_bring_is_told_at_its_line(visitor: Visitor, text: str, words: str, line: int) -> None:

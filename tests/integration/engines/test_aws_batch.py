@@ -345,10 +345,10 @@ def test_a_missing_configuration_is_reported_in_one_line(tmp_path: Path) -> None
     [
         ('{"regoin": "eu-west-1"}', "unknown key 'regoin'; did you mean region?"),
         ('{"region": "eu-west-1", "image": "i"}', "job_queue: is required"),
-        ('{"region": "eu-west-1", "job_queue": "q", "image": "i", "poll": "2"}', "poll: expected a number, found a text ('2')"),
+        ('{"region": "eu-west-1", "job_queue": "q", "image": "i", "poll": "2"}', "poll: expected a number, found a string ('2')"),
         ('{"region": "eu-west-1", "job_queue": "q", "image": "i", "poll": 0}', "poll: expected a value greater than 0, found 0"),
-        ('{"region": null, "job_queue": "q", "image": "i"}', "region: expected a text, found nothing"),
-        ("[]", "expected a mapping, found a list; `muster aws up` writes it anew"),
+        ('{"region": null, "job_queue": "q", "image": "i"}', "region: expected a string, found nothing"),
+        ("[]", "expected an object, found a list; `muster aws up` writes it anew"),
         ('{"region":', "Invalid JSON: EOF while parsing a value at line 1 column 10; `muster aws up` writes it anew"),
     ],
 )  # fmt: skip

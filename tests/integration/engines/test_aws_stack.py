@@ -317,7 +317,7 @@ def test_status_lists_the_resources_and_writes_the_engine_s_configuration(accoun
     assert (account.home / "aws.json").read_text() == before
     (account.home / "aws.json").write_text(json.dumps({**json.loads(before), "poll": "2"}))
     refused = account.muster("status", "--write").stderr
-    assert refused.splitlines()[-1].endswith("aws.json: poll: expected a number, found a text ('2')")
+    assert refused.splitlines()[-1].endswith("aws.json: poll: expected a number, found a string ('2')")
     (account.home / "aws.json").write_text(before)
     assert told["queue"]["status"] == "VALID" and told["outputs"]["JobQueue"] == "muster"
     assert account.muster("status", "--stack-name", "other").stderr == NO_STACK.format("other")

@@ -206,7 +206,7 @@ MOUNTED["mountPoints"] = [{"sourceVolume": "v", "containerPath": "/mnt"}]
         ),
         ({"gpus": 3}, "Slurm refuses the job: .*Requested node configuration is not available"),
         ({"cpus": 5}, "Slurm refuses the job: .*Requested node configuration is not available"),
-        ({"options": {"nice": "much"}}, "muster:nice is 'much', not a whole number"),
+        ({"options": {"nice": "much"}}, "muster:nice is 'much', not an integer"),
         ({"title": "a\nb"}, "title .* has a control character"),
         (UNEQUAL, "Slurm requires identical nodes, these differ .*64 MiB.*128 MiB"),
         ({"containers": [MOUNTED]}, "volume /mnt: the slurm engine mounts nothing"),

@@ -103,7 +103,7 @@ def test_a_second_controller_refuses_a_run_that_the_first_is_writing(tmp_path: P
         (damaged.path / "EPOCH").write_text("99999999999999999999999\n")
         ended = second.wait(second.gang("pass", env={"MUSTER_RUN": "damaged"}))
         assert ended["status"] == "FAILED" and ended["statusReason"] == (
-            f"store {store.path}: can't read run damaged: {damaged.path}/EPOCH: expected a whole number of at most 15 "
+            f"store {store.path}: can't read run damaged: {damaged.path}/EPOCH: expected an integer of at most 15 "
             "digits, found '99999999999999999999999'"
         )
     assert second.process.stderr is not None

@@ -20,7 +20,7 @@ from orchestrator.server import Server
 from orchestrator.services import automatic_evaluations as automatic
 from orchestrator.services import submission
 from shared_store.volume.checkpoints import list_checkpoints, retain
-from shared_store.volume.evaluations import keep_for_evaluation, wanted_checkpoints
+from shared_store.volume.evaluations import keep_for_evaluation, pending_checkpoints
 from tests.conftest import call_muster, submit_gang
 from tests.support.definitions import container, multinode
 from tests.support.orchestrator.jobs import FOREVER
@@ -216,11 +216,11 @@ def test_a_checkpoint_kept_by_a_killed_controller_for_no_job_is_released(control
     controller.end(controller.newest()["job"])
     controller.look()
     run = controller.server.store.run("taught")
-    assert wanted_checkpoints(run) == set()
+    assert pending_checkpoints(run) == set()
     keep_for_evaluation(run, "00000010-e1")
     controller.stop()
     controller.start()
-    wait_for(lambda: wanted_checkpoints(run) == set(), what="the claim is given up")
+    wait_for(lambda: pending_checkpoints(run) == set(), what="the claim is given up")
 
 
 def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_no_more(controller: Controller) -> None:

@@ -30,7 +30,7 @@ SPEC = "job_specs/cartpole.yaml"
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["run", "{spec}"], "{spec}:2: nodes: expected a whole number of nodes"),
+        (["run", "{spec}"], "{spec}:2: nodes: expected an integer number of nodes"),
         (["submit", "nowhere.yaml"], "nowhere.yaml: No such file"),
         (["submit", SPEC, "--set", "novalue"], "--set novalue: expected KEY=VALUE"),
         (["submit", SPEC, "--set", "train.task=Cartpol", "--dry-run"], "muster: --set: train.task: no task is called"),

@@ -152,7 +152,7 @@ def test_an_option_of_an_engine_that_is_misspelt_is_refused_when_the_tag_is_made
         assert "no such engine; did you mean slurm?" in said
         client.batch("CreateComputeEnvironment", **slurm, tags={"muster:engine": "slurm", "muster:partition": "gpu"})
         tagged = refused("TagResource", resourceArn=f"{arn}compute-environment/cluster", tags={"muster:nice": "low"})
-        assert "tag muster:nice is 'low', not a whole number" in tagged
+        assert "tag muster:nice is 'low', not an integer" in tagged
         night = {"jobQueueName": "night", "priority": 1}
         night["computeEnvironmentOrder"] = [{"order": 1, "computeEnvironment": "cluster"}]
         assert "did you mean qos?" in refused("CreateJobQueue", **night, tags={"muster:qs": "low"})

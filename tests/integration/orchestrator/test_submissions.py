@@ -67,7 +67,7 @@ ENVIRONMENTS: dict[str, tuple[dict[str, str], str]] = {
     "a time that is none": ({"MUSTER_STALL_TIMEOUT": "soon"}, "MUSTER_STALL_TIMEOUT, .* is malformed"),
     "a time without an end": ({"MUSTER_STALL_TIMEOUT": "nan"}, "MUSTER_STALL_TIMEOUT, .* is malformed"),
     "no ranks": ({"MUSTER_RANKS_PER_NODE": "0"}, "MUSTER_RANKS_PER_NODE .* is malformed"),
-    "nodes that are no number": ({"MUSTER_MIN_NODES": "few"}, "MUSTER_MIN_NODES is 'few'; expected a whole number"),
+    "nodes that are no number": ({"MUSTER_MIN_NODES": "few"}, "MUSTER_MIN_NODES is 'few'; expected an integer"),
     "an unknown policy": ({"MUSTER_ON_CHILD_FAILURE": "garbage"}, "MUSTER_ON_CHILD_FAILURE: expected restart, fail or"),
     "no policy": ({"MUSTER_ON_CHILD_FAILURE": ""}, "MUSTER_ON_CHILD_FAILURE: expected restart, fail or"),
     "a run that can't be named so": ({"MUSTER_RUN": "../x"}, r"MUSTER_RUN '../x': a run is named with"),
@@ -111,8 +111,14 @@ BODIES: dict[str, tuple[dict[str, Any] | str, str]] = {
         {"spec": {**TRAIN, "train": {**TRAIN["train"], "config": {"deeper": ["\ud800"]}}}},
         "spec: train.config.deeper.0: half of a character",
     ),
-    "a zero byte in a command": ({"spec": {**SPEC, "command": ["a\0"]}}, "spec: command.0: expected a text without a"),
-    "a zero byte in an image": ({"spec": {**SPEC, "image": "a\0"}}, "spec: image: expected a text without a zero byte"),
+    "a zero byte in a command": (
+        {"spec": {**SPEC, "command": ["a\0"]}},
+        "spec: command.0: expected a string without a",
+    ),
+    "a zero byte in an image": (
+        {"spec": {**SPEC, "image": "a\0"}},
+        "spec: image: expected a string without a zero byte",
+    ),
     "a variable of Muster": (
         {"spec": {**SPEC, "environment": {"MUSTER_SPEC": "{}"}}},
         "environment: MUSTER_SPEC is res",

@@ -80,7 +80,7 @@ def test_a_form_makes_a_track_for_good(console: Console, visitor: Visitor) -> No
     ("wrong", "message"),
     [
         ({"length": "2"}, "length 2 m: expected 4 to 1000 m"),
-        ({"length": "long"}, "length: expected a number, found a text ('long')"),
+        ({"length": "long"}, "length: expected a number, found a string ('long')"),
         ({"least_radius": "nan"}, "least_radius: expected a finite number"),
         ({"seed": "-1"}, "seed: expected a value greater than or equal to 0, found '-1'"),
         ({"seed": ""}, "give one of preset and seed"),

@@ -204,12 +204,15 @@ BY_ENGINE = "a node is started by one of Muster's engines"
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"EPOCH": ""}, "RUN/EPOCH: expected a whole number of at most 15 digits, found ''"),
+        ({"EPOCH": ""}, "RUN/EPOCH: expected an integer of at most 15 digits, found ''"),
         ({"MUSTER_JOB_ID": None}, f"MUSTER_JOB_ID is missing; {BY_ENGINE}"),
         ({"MUSTER_STORE": None}, f"MUSTER_STORE is missing; {BY_ENGINE}"),
-        ({"MUSTER_EPOCH": "x"}, f"MUSTER_EPOCH is 'x', not a whole number; {BY_ENGINE}"),
+        ({"MUSTER_EPOCH": "x"}, f"MUSTER_EPOCH is 'x', not an integer; {BY_ENGINE}"),
         ({"MUSTER_GRACE_SECONDS": "x"}, f"MUSTER_GRACE_SECONDS is 'x', not a number; {BY_ENGINE}"),
-        ({"MUSTER_RUN": "../x"}, "run name '../x': use letters, digits, '.', '_' and '-' only, at most 128 of them"),
+        (
+            {"MUSTER_RUN": "../x"},
+            "run name '../x': use letters, digits, '.', '_' and '-' only, at most 128 of them, the first a letter or digit",
+        ),
         ({"MUSTER_STORE": "/dev/null"}, "store: Not a directory: /dev/null/runs/run/EPOCH"),
     ],
 )

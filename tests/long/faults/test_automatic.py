@@ -45,8 +45,8 @@ def test_checkpoints_are_evaluated_beside_a_training_once_each_though_the_contro
         server.wait(each["id"], "SUCCEEDED")
     jobs = evaluations_of(server)
     found = list_evaluations(run)
-    asked = [each["spec"]["evaluate"]["checkpoint"] for each in jobs]
-    assert len(asked) == len(set(asked)) and len({each["checkpoint"] for each in found}) == len(found)
+    requested = [each["spec"]["evaluate"]["checkpoint"] for each in jobs]
+    assert len(requested) == len(set(requested)) and len({each["checkpoint"] for each in found}) == len(found)
     assert {each["job"] for each in found} == {each["id"] for each in jobs}
     assert not any(each["keep"] for each in found)
     best, told = best_checkpoint(run), server.detail(training)["results"]

@@ -51,10 +51,10 @@ def test_killed_it_ends_with_the_same_bits(tmp_path: Path, name: str) -> None:
     home, options = tmp_path / "home", ["--set", "checkpoint.every=4", "--cpus", "2"]
     if name == "student":
         (tmp_path / "teacher.yaml").write_text(JOBS["teacher"])
-        said = muster(home, tmp_path, "run", "teacher.yaml", "--set", "train.iterations=3", *options)
-        (run,) = set(re.findall(r"\bteacher-[0-9a-f]{8}\b", said))
+        message = muster(home, tmp_path, "run", "teacher.yaml", "--set", "train.iterations=3", *options)
+        (run,) = set(re.findall(r"\bteacher-[0-9a-f]{8}\b", message))
         job = re.sub(r"teacher_checkpoint: \S+", f"teacher_checkpoint: {run}@3", job)
     (tmp_path / "job.yaml").write_text(job)
-    said = muster(home, tmp_path, "verify-resume", "job.yaml", "--at", "9", "--iterations", "3", *options)
-    assert re.search(r"^equal: \d+ tensors, 12 iterations$", said, re.MULTILINE), said
-    assert re.search(r"resumed from iteration [48]$", said, re.MULTILINE), said
+    message = muster(home, tmp_path, "verify-resume", "job.yaml", "--at", "9", "--iterations", "3", *options)
+    assert re.search(r"^equal: \d+ tensors, 12 iterations$", message, re.MULTILINE), message
+    assert re.search(r"resumed from iteration [48]$", message, re.MULTILINE), message

@@ -234,9 +234,9 @@ def test_training_does_not_notice_a_controller_that_is_killed_and_comes_back(ser
     wait_for(lambda: _iteration(server, job["run"]) > reached + 10, 30, "progress without a controller")
     server.start()
     wait_for(lambda: server.muster("stacks", job["id"]).returncode == 0, 30, "the node on the new router")
-    said = server.muster("checkpoint", job["id"]).stdout
-    saved = re.fullmatch(r"checkpoint (\d{8})-e1\n", said)
-    assert saved, said
+    message = server.muster("checkpoint", job["id"]).stdout
+    saved = re.fullmatch(r"checkpoint (\d{8})-e1\n", message)
+    assert saved, message
     names = [each["name"] for each in server.client.get(f"/api/runs/{job['run']}/checkpoints")]
     assert f"{saved[1]}-e1" in names
     stacks = server.muster("stacks", job["id"]).stdout
@@ -267,9 +267,9 @@ def test_a_training_that_still_starts_has_nothing_to_save(server: Serving) -> No
     job = server.gang("import time; time.sleep(600)", env=starts)
     server.wait(job, "RUNNING")
     wait_for(lambda: server.muster("stacks", job).returncode == 0, 30, "the node on the bus")
-    said = server.muster("checkpoint", job)
-    assert said.stdout == f"job {job[:8]} has not begun its first iteration: nothing to save yet\n"
-    assert said.returncode == 1
+    message = server.muster("checkpoint", job)
+    assert message.stdout == f"job {job[:8]} has not begun its first iteration: nothing to save yet\n"
+    assert message.returncode == 1
 
 
 def test_a_rank_that_freezes_is_found_with_its_stacks_and_the_gang_restarts(server: Serving) -> None:

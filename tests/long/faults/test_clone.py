@@ -145,7 +145,7 @@ def begin(store: Path, task: Any = Point, **settings: Any) -> Loop:
 
 
 @pytest.mark.parametrize(
-    ("kind", "settings", "said"),
+    ("kind", "settings", "message"),
     [
         (
             "ppo",
@@ -174,10 +174,10 @@ def begin(store: Path, task: Any = Point, **settings: Any) -> Loop:
     ],
 )
 def test_weights_that_do_not_fit_are_refused_in_one_line(
-    store: Path, kind: str, settings: dict[str, Any], said: str
+    store: Path, kind: str, settings: dict[str, Any], message: str
 ) -> None:
     make_clone(store, "clone", kind)
-    with pytest.raises(UserError, match=said) as error:
+    with pytest.raises(UserError, match=message) as error:
         begin(store, **settings)
     assert "00000004-e1" in str(error.value) and "\n" not in str(error.value)
 
@@ -196,8 +196,8 @@ def test_other_observations_are_named_with_the_tensor(store: Path) -> None:
 def test_observations_of_other_names_are_warned_of(store: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make_clone(store, "clone", "ppo")
     begin(store, Renamed)
-    assert "warning: the weights were learnt with another policy contract: " in (said := capsys.readouterr().out)
-    assert "observation 1: velocity is gone; observation 1: speed is new" in said
+    assert "warning: the weights were learnt with another policy contract: " in (message := capsys.readouterr().out)
+    assert "observation 1: velocity is gone; observation 1: speed is new" in message
 
 
 @dataclasses.dataclass
@@ -239,10 +239,14 @@ def test_weights_that_are_damaged_or_gone_are_refused(store: Path, harm: str) ->
     else:  # somebody deleted the run while its job waited; the controller then made a new one
         shutil.rmtree(run.path)
         run.path.mkdir()
-    said = {"missing": "learner.pt is missing", "altered": "was altered", "all of it": "run.json does not name them"}[
-        harm
-    ]
-    with pytest.raises(UserError, match=f"run clone can't begin with the weights of ppo@4: .*{said}.*clone it again"):
+    message = {
+        "missing": "learner.pt is missing",
+        "altered": "was altered",
+        "all of it": "run.json does not name them",
+    }[harm]
+    with pytest.raises(
+        UserError, match=f"run clone can't begin with the weights of ppo@4: .*{message}.*clone it again"
+    ):
         begin(store, MUSTER_PARENT="ppo@4")
 
 

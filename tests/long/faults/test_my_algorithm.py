@@ -52,13 +52,13 @@ def test_it_learns_cartpole_as_it_is_shipped(mine: type) -> None:
 
 
 def test_its_settings_are_checked(mine: type) -> None:
-    for given, said in (
+    for values, message in (
         ({"gama": 0.9}, "train.settings.gama: there is no such setting; did you mean gamma?"),
         ({"gamma": 2.0}, "train.settings.gamma: expected a value less than or equal to 1, found 2.0"),
     ):
         with pytest.raises(UserError) as caught:
-            settings(mine, OWN, PointConfig(), {"settings": given})
-        assert str(caught.value) == said
+            settings(mine, OWN, PointConfig(), {"settings": values})
+        assert str(caught.value) == message
 
 
 def test_killed_it_ends_with_the_same_bits_and_is_evaluated_and_exported(tmp_path: Path) -> None:

@@ -240,11 +240,13 @@ def test_a_setting_of_rsl_rl_that_its_state_holds_is_refused(store: Path, run: s
     name = key + "." if value == CURIOUS else "algorithm.rnd_cfg." if value == {} else key
     with pytest.raises(UserError) as error:
         go_on(store, run, with_value(settings, key, value))
-    said = str(error.value)
+    message = str(error.value)
     if key == "algorithm.class_name" and run == "pupil":
-        assert "train.rsl_rl.algorithm.gradient_length: there is no such key" in said
+        assert "train.rsl_rl.algorithm.gradient_length: there is no such key" in message
     else:
-        assert f"rsl_rl.{name}" in said and " there and " in said and "start a new run for that" in said, said
+        assert f"rsl_rl.{name}" in message and " there and " in message and "start a new run for that" in message, (
+            message
+        )
 
 
 @pytest.mark.parametrize("key", RND_APPLIED)
@@ -269,8 +271,8 @@ def test_what_muster_gives_an_algorithm_of_rsl_rl_is_no_setting(store: Path, nam
 
 
 def go_on_with_own(store: Path, **settings: Any) -> Loop:
-    given = {"hidden_sizes": [8], "steps": 8, **settings}
-    return runner(training(store, run="own", iterations=2, epoch=2, algorithm=OWN, settings=given))
+    values = {"hidden_sizes": [8], "steps": 8, **settings}
+    return runner(training(store, run="own", iterations=2, epoch=2, algorithm=OWN, settings=values))
 
 
 def test_settings_of_an_algorithm_of_ones_own_are_applied_or_refused_as_its_class_says(store: Path) -> None:

@@ -56,8 +56,8 @@ def test_a_full_disk_costs_saves_and_nothing_else(on_volume: Serving, volume: Pa
     last = list_checkpoints(run)[-1]
     progress = on_volume.client.get(f"/api/jobs/{job['id']}")
     wait_for(lambda: on_volume.muster("checkpoint", job["id"]).returncode == 1, 30, "a save that is refused")
-    said = on_volume.muster("checkpoint", job["id"])
-    assert "could not be saved (No space left on device: " in said.stdout and "training goes on" in said.stdout
+    message = on_volume.muster("checkpoint", job["id"])
+    assert "could not be saved (No space left on device: " in message.stdout and "training goes on" in message.stdout
     list_checkpoints(run)[-1].verify()
     assert list_checkpoints(run)[-1].iteration >= last.iteration
     assert on_volume.detail(job["id"])["status"] == "RUNNING" == progress["status"]
@@ -78,10 +78,10 @@ def test_a_store_that_turns_read_only_keeps_the_last_checkpoint(on_volume: Servi
     if aborted.returncode:
         pytest.skip(f"a busy volume can't be made read-only here: {aborted.stderr.strip()}")
     kept = [checkpoint.name for checkpoint in list_checkpoints(run)]
-    said = on_volume.muster("checkpoint", job["id"])
-    assert said.returncode == 1 and "could not be saved" in said.stdout and "training goes on" in said.stdout, (
-        said.stdout
-    )
+    message = on_volume.muster("checkpoint", job["id"])
+    assert (
+        message.returncode == 1 and "could not be saved" in message.stdout and "training goes on" in message.stdout
+    ), message.stdout
     assert on_volume.detail(job["id"])["status"] == "RUNNING"
     assert [checkpoint.name for checkpoint in list_checkpoints(run)] == kept
     list_checkpoints(run)[-1].verify()
@@ -115,8 +115,8 @@ def test_a_run_that_is_deleted_while_it_trains_does_not_come_back_in_part(server
     run = Store(server.home / "store").run(job["run"])
     while run.path.exists():  # what trains may write into it meanwhile
         shutil.rmtree(run.path, ignore_errors=True)
-    said = server.muster("checkpoint", job["id"])
-    assert said.returncode == 1 and "could not be saved (No such file or directory: " in said.stdout
+    message = server.muster("checkpoint", job["id"])
+    assert message.returncode == 1 and "could not be saved (No such file or directory: " in message.stdout
     assert server.muster("stop", job["id"]).returncode == 0
     detail = server.detail(job["id"])
     assert detail["status"] == "FAILED"

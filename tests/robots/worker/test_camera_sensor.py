@@ -222,7 +222,7 @@ def test_each_episode_may_draw_a_new_mount(context: SensorContext) -> None:
         ({"body": "arm", "robot": "robt"}, "CameraSensor.robot: there is no robot 'robt'; did you mean robot?"),
         ({"site": "*e", "body": "arm"}, "CameraSensor: give either body or site, and not both"),
         ({"kind": "gray"}, "CameraSensor.kind: there is no kind 'gray'; did you mean grey?"),
-        ({"width": 0}, "CameraSensor.width: expected a whole number from 1 to 1024, found 0"),
+        ({"width": 0}, "CameraSensor.width: expected an integer from 1 to 1024, found 0"),
         ({"fov": 180.0}, "CameraSensor.fov: expected an angle between 0 and pi [rad], found 180.0"),
         ({"kind": "depth", "near": 2.0, "far": 1.0}, "CameraSensor.near and far: expected 0 <= near < far"),
         ({"kind": "depth", "samples": 4}, "CameraSensor.samples: depth takes one ray per pixel"),

@@ -47,11 +47,11 @@ def proven(process: subprocess.Popen[str], iterations: int) -> tuple[str, str, i
     assert process.returncode == 0, output + errors
     tensors = re.search(rf"^equal: (\d+) tensors, {iterations} iterations$", output, re.MULTILINE)
     assert tensors and int(tensors[1]) > 30, output
-    told = re.search(
+    result = re.search(
         r"^straight: (\S+)\nkilled: +(\S+), by SIGKILL .* resumed from iteration (\d+)$", output, re.MULTILINE
     )
-    assert told, output
-    return told[1], told[2], int(told[3])
+    assert result, output
+    return result[1], result[2], int(result[3])
 
 
 @pytest.fixture(scope="module")
@@ -120,8 +120,8 @@ def test_stopped_and_resumed_ends_with_the_same_bits(home: Path, straight: str) 
         assert server.wait(resumed["jobId"], timeout=120)["status"] == "SUCCEEDED"
     finally:
         server.close()
-    said = same_bits(home / "store", straight, run.name)
-    assert re.fullmatch(r"equal: \d+ tensors, 100 iterations\n", said), said
+    message = same_bits(home / "store", straight, run.name)
+    assert re.fullmatch(r"equal: \d+ tensors, 100 iterations\n", message), message
 
 
 @pytest.mark.parametrize(

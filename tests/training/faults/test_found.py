@@ -7,28 +7,9 @@ import shutil
 import sqlite3
 from pathlib import Path
 
-from shared_store.volume.checkpoints import CheckpointWriter, list_checkpoints
-from shared_store.volume.epoch import raise_epoch
-from shared_store.volume.layout import Store
+from shared_store.volume.checkpoints import list_checkpoints
 from tests.conftest import Serving
 from tests.support.worker.trained import run_in
-
-
-def test_a_commit_removes_what_a_killed_writer_left_but_not_what_comes_next(tmp_path: Path) -> None:
-    """A writer that dies does not end its attempt, so nobody may start after it who would sweep."""
-    run = Store(tmp_path).open().run("ant")
-    run.create({"run": "ant"})
-    raise_epoch(run, 2)
-    for iteration, epoch in ((10, 1), (20, 2), (40, 2), (10, 3)):
-        (CheckpointWriter(run, iteration, epoch).path / "rank-1.pt").write_bytes(b"half")
-    (run.checkpoints / ".LATEST.0a1b2c3d.tmp").write_bytes(b"half")
-    (run.checkpoints / ".00000005-e1.0a1b2c3d.trash").mkdir()
-    writer = CheckpointWriter(run, 30, 2)
-    (writer.path / "learner.pt").write_bytes(b"whole")
-    writer.commit({}, keep=3)
-    assert [checkpoint.name for checkpoint in list_checkpoints(run)] == ["00000030-e2"]
-    hidden = sorted(entry.name for entry in run.checkpoints.iterdir() if entry.name.startswith("."))
-    assert hidden == [".00000010-e3.tmp", ".00000040-e2.tmp"]
 
 
 def test_a_job_that_was_struck_after_its_last_save_may_be_resumed_for_its_evaluation(

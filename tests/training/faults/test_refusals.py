@@ -87,8 +87,8 @@ def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
     ],
 )
 def test_another_seed_network_or_number_of_worlds(served: tuple[Serving, str], change: str, parts: list[str]) -> None:
-    said = refused(served, 2, "--set", change)
-    assert all(part in said for part in (served[1], *parts)), said
+    message = refused(served, 2, "--set", change)
+    assert all(part in message for part in (served[1], *parts)), message
 
 
 def test_a_learning_rate_that_the_checkpoint_s_job_had_and_that_has_adapted_since(served: tuple[Serving, str]) -> None:
@@ -97,9 +97,9 @@ def test_a_learning_rate_that_the_checkpoint_s_job_had_and_that_has_adapted_sinc
     rate = newest.manifest["learning_rate"]
     edit_manifest(newest, learning_rate=4e-4)
     try:
-        said = refused(served, 2, "--set", "train.ppo.learning_rate=1.0e-3")
-        assert "train.ppo.learning_rate is 0.001 already" in said and "which is 0.0004 now" in said, said
-        assert "or train.ppo.schedule=fixed" in said
+        message = refused(served, 2, "--set", "train.ppo.learning_rate=1.0e-3")
+        assert "train.ppo.learning_rate is 0.001 already" in message and "which is 0.0004 now" in message, message
+        assert "or train.ppo.schedule=fixed" in message
     finally:
         edit_manifest(newest, learning_rate=rate)
 
@@ -110,8 +110,10 @@ def test_a_checkpoint_of_a_newer_format(served: tuple[Serving, str]) -> None:
     edit_manifest(newest, format=FORMAT + 1)
     try:
         for arguments in ([], ["--checkpoint", "2"]):
-            said = refused(served, 1, *arguments)
-            assert f"{newest.name}: has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster" in said
+            message = refused(served, 1, *arguments)
+            assert (
+                f"{newest.name}: has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster" in message
+            )
     finally:
         edit_manifest(newest, format=FORMAT)
 
@@ -182,8 +184,8 @@ def test_the_worker_never_sets_a_newer_format_aside(store: Path) -> None:
 def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, name: str) -> None:
     (newest,) = list_checkpoints(Store(store).run("run"))
     poison(newest, name, tmp_path / "executed")
-    said = refusal(go_on, store, error=UserError)
-    assert re.search(rf"{name} asks for \w+\.mkdir: only tensors and plain values", said)
+    message = refusal(go_on, store, error=UserError)
+    assert re.search(rf"{name} asks for \w+\.mkdir: only tensors and plain values", message)
     if name == "learner.pt":
         with pytest.raises(UserError, match="asks for"):  # as `muster export` and `evaluate` read it
             read_file(newest, "learner.pt")
@@ -191,7 +193,7 @@ def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, na
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "message"),
     [
         (b"", "learner.pt"),
         (b"no archive at all", "learner.pt"),
@@ -199,7 +201,7 @@ def test_the_worker_runs_no_code_of_a_checkpoint(store: Path, tmp_path: Path, na
         ({"progress": {}}, "does not fit this job's task and algorithm: 'algorithm'"),
     ],
 )
-def test_a_file_of_something_else_is_named(store: Path, content: Any, said: str) -> None:
+def test_a_file_of_something_else_is_named(store: Path, content: Any, message: str) -> None:
     (newest,) = list_checkpoints(Store(store).run("run"))
     path = newest.path / "learner.pt"
     if isinstance(content, bytes):
@@ -208,4 +210,4 @@ def test_a_file_of_something_else_is_named(store: Path, content: Any, said: str)
         torch.save(content, path)
     entry = {"size": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
     edit_manifest(newest, files={**newest.manifest["files"], "learner.pt": entry})
-    assert said in refusal(go_on, store, error=UserError)
+    assert message in refusal(go_on, store, error=UserError)

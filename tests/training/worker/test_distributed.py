@@ -225,7 +225,7 @@ def test_the_warm_marker_depends_on_the_task_and_lives_in_the_cache(
 @pytest.mark.parametrize(
     ("env", "message"),
     [
-        ({"RANK": "x"}, "RANK is 'x', not a whole number"),
+        ({"RANK": "x"}, "RANK is 'x', not an integer"),
         ({"RANK": "2", "WORLD_SIZE": "2"}, "RANK is 2 in a WORLD_SIZE of 2"),
     ],
 )

@@ -114,7 +114,7 @@ def test_an_evaluation_that_is_asked_to_stop_leaves_with_75_and_records_nothing(
 @pytest.mark.parametrize(
     ("section", "said"),
     [
-        ({"episodes": 0}, "episodes: expected a whole number of at least 1, got 0"),
+        ({"episodes": 0}, "episodes: expected an integer of at least 1, got 0"),
         (
             {"config": {"angle_limt": 1.0}},
             "evaluate.config.angle_limt: CartpoleConfig has no such key; did you mean angle_limit?",

@@ -223,7 +223,7 @@ def test_a_newer_attempt_stops_this_one(tmp_path: Path) -> None:
     [
         ({"ppo": {"learning_rat": 1e-3}}, "ppo.learning_rat: there is no such setting; did you mean learning_rate?"),
         ({"ppo": {"rnd_cfg": {}}}, "ppo.rnd_cfg: there is no such setting; algorithm rsl_rl has it"),
-        ({"ppo": {"learning_rate": "fast"}}, "train.ppo.learning_rate: expected a number, found a text ('fast')"),
+        ({"ppo": {"learning_rate": "fast"}}, "train.ppo.learning_rate: expected a number, found a string ('fast')"),
     ],
 )
 def test_wrong_overrides_are_refused(section: dict, message: str) -> None:

@@ -51,7 +51,7 @@ def test_a_bundle_passes_its_self_test_and_shows_its_joints_unless_the_domain_is
     assert "knee  position [rad] -1.500 to 1.500, default position 0.3000, stiffness 20, damping 1" in said
     monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
     assert main([str(bundle), "--check"]) == 1
-    assert capsys.readouterr().err == "error: ROS_DOMAIN_ID=seven: expected a whole number\n"
+    assert capsys.readouterr().err == "error: ROS_DOMAIN_ID=seven: expected an integer\n"
 
 
 def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: Path) -> None:
@@ -242,7 +242,7 @@ UNFIT = {
         "--strct-limits: there is no such option; did you mean --strict-limits? see: muster-policy --help"
     ),
     "x y": "y: more arguments than the command takes; see: muster-policy --help",
-    "x --domain ten": "--domain: expected a whole number, found ten; see: muster-policy --help",
+    "x --domain ten": "--domain: expected an integer, found ten; see: muster-policy --help",
     "x --rate": "--rate: expected one argument; see: muster-policy --help",
 }
 

@@ -108,8 +108,8 @@ def test_a_race_is_read_with_its_penalties_and_its_times_are_equal_to_the_millis
         (lambda found: found["trials"][1].update(time=None), "race.trials.1.time: expected the lap's time in seconds"),
         (lambda found: found["trials"][1].update(time=-1.0), "race.trials.1.time: expected the lap's time in seconds"),
         (lambda found: found["trials"][1].update(time=float("inf")), "race.trials.1.time: expected the lap's time"),
-        (lambda found: found["trials"][2].update(resets=-1), "race.trials.2.resets: expected a whole number, found -1"),
-        (lambda found: found["trials"][2].update(crashes="1"), "race.trials.2.crashes: expected a whole number"),
+        (lambda found: found["trials"][2].update(resets=-1), "race.trials.2.resets: expected an integer, found -1"),
+        (lambda found: found["trials"][2].update(crashes="1"), "race.trials.2.crashes: expected an integer"),
     ],
 )
 def test_a_malformed_race_is_refused_with_its_place(change: Any, output: str) -> None:

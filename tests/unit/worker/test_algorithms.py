@@ -134,12 +134,12 @@ def read(train: dict[str, Any], **spec: Any) -> Job:
 @pytest.mark.parametrize(
     ("train", "said"),
     [
-        ({"ppo": 5}, "train.ppo: expected a mapping, found a whole number (5)"),
-        ({"algorithm": "sac", "sac": [1]}, "train.sac: expected a mapping, found a list"),
-        ({"algorithm": "my:Mine", "settings": "x"}, "train.settings: expected a mapping, found a text ('x')"),
-        ({"config": True}, "train.config: expected a mapping, found true or false (True)"),
-        ({"algorithm": 5}, "train.algorithm: expected a text, found a whole number (5)"),
-        ({"algorithm": None}, "train.algorithm: expected a text, found nothing"),
+        ({"ppo": 5}, "train.ppo: expected an object, found an integer (5)"),
+        ({"algorithm": "sac", "sac": [1]}, "train.sac: expected an object, found a list"),
+        ({"algorithm": "my:Mine", "settings": "x"}, "train.settings: expected an object, found a string ('x')"),
+        ({"config": True}, "train.config: expected an object, found true or false (True)"),
+        ({"algorithm": 5}, "train.algorithm: expected a string, found an integer (5)"),
+        ({"algorithm": None}, "train.algorithm: expected a string, found nothing"),
     ],
 )
 def test_an_invalid_section_is_refused_in_one_line(train: dict[str, Any], said: str) -> None:
@@ -147,7 +147,7 @@ def test_an_invalid_section_is_refused_in_one_line(train: dict[str, Any], said: 
 
 
 def test_an_invalid_section_of_the_spec_is_refused_too() -> None:
-    with pytest.raises(UserError, match=r"^checkpoint: expected a mapping, found a whole number \(5\)$"):
+    with pytest.raises(UserError, match=r"^checkpoint: expected an object, found an integer \(5\)$"):
         read({"task": "Ant"}, checkpoint=5)
     assert read({"task": "Ant", "ppo": None, "config": {}}, checkpoint=None).section["task"] == "Ant"
 

@@ -132,8 +132,8 @@ NORMALISED = {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN}
     ("section", "message"),
     [
         ({"algorithm": {"class_name": "PPOO"}}, r"algorithm\.class_name: Could not resolve 'PPOO'"),
-        (own(gamma="99e-2"), r"algorithm\.gamma: expected a number, found a text \('99e-2'\)$"),
-        (own(num_mini_batches=2.5), r"algorithm\.num_mini_batches: expected a whole number, found a number \(2\.5\)$"),
+        (own(gamma="99e-2"), r"algorithm\.gamma: expected a number, found a string \('99e-2'\)$"),
+        (own(num_mini_batches=2.5), r"algorithm\.num_mini_batches: expected an integer, found a number \(2\.5\)$"),
         ({"algorithm": {"num_mini_batches": 65}}, r"algorithm\.num_mini_batches: 65 .* samples; a rank has 64"),
         ({"critic": GRU, **BATCHES}, r"algorithm\.num_mini_batches: 9 .* worlds, .* recurrent; a rank has 8"),
         ({"actor": {"class_name": "nowhere:Net"}}, r"actor\.class_name: No module named 'nowhere'"),

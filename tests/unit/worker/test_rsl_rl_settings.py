@@ -41,7 +41,7 @@ def scheduled(**keys: Any) -> dict[str, Any]:
 
 
 FINITE = r"expected a finite number, found a number \(inf\)$"
-WHOLE = r"expected a whole number, found a number \(2\.5\)$"
+WHOLE = r"expected an integer, found a number \(2\.5\)$"
 SCHEDULE = r"algorithm\.rnd_cfg\.weight_schedule"
 
 
@@ -51,12 +51,12 @@ SCHEDULE = r"algorithm\.rnd_cfg\.weight_schedule"
         ({"max_iterations": 3}, r"max_iterations: there is no such setting; use train\.iterations$"),
         ({"actr": {}}, r"actr: there is no such setting; did you mean actor\?$"),
         ({"num_steps_per_env": 0}, r"num_steps_per_env: expected a value greater than or equal to 1, found 0$"),
-        ({"obs_groups": {"actor": "policy"}}, r"obs_groups\.actor: expected a list, found a text"),
+        ({"obs_groups": {"actor": "policy"}}, r"obs_groups\.actor: expected a list, found a string"),
         ({"actor": {"distribution_cfg": {"init_std": math.inf}}}, rf"actor\.distribution_cfg\.init_std: {FINITE}"),
         (ppo(class_name="own:PPO", anything=[math.inf]), rf"algorithm\.anything\.0: {FINITE}"),
         (ppo(num_mini_batches=2.5), rf"algorithm\.num_mini_batches: {WHOLE}"),
-        (ppo(gamma="99e-2"), r"algorithm\.gamma: .* found a text \('99e-2'\); in YAML it is written 99\.0e-2$"),
-        (ppo(class_name=5), r"algorithm\.class_name: expected a text, found 5$"),
+        (ppo(gamma="99e-2"), r"algorithm\.gamma: .* found a string \('99e-2'\); in YAML it is written 99\.0e-2$"),
+        (ppo(class_name=5), r"algorithm\.class_name: expected a string, found 5$"),
         (ppo(rnd_cfg={"weight": 1.0}), r"algorithm\.rnd_cfg\.num_outputs: is required$"),
         (ppo(rnd_cfg=scheduled(mode="cosine")), rf"{SCHEDULE}\.mode: expected constant, step, linear, "),
         (ppo(rnd_cfg=scheduled(mode="step", final_step=3)), rf"{SCHEDULE}\.final_value: is required$"),

@@ -81,7 +81,7 @@ def test_a_plain_dataclass_is_checked_by_the_types_of_its_fields() -> None:
     assert config == PendulumConfig(torque=2.0, randomize=Randomization(mass=(1.0, 2.0)), rewards={"effort": -1.0})
     for overrides, said in (
         ({"torqe": 1}, "torqe: PendulumConfig has no such key; did you mean torque?"),
-        ({"torque": "much"}, "torque: expected a number, found a text ('much')"),
+        ({"torque": "much"}, "torque: expected a number, found a string ('much')"),
         ({"episode_seconds": -1}, "episode_seconds: expected a value greater than 0, found -1.0"),
         ({"rewards": {"speed": float("nan")}}, "rewards.speed: expected a finite number, found a number (nan)"),
     ):
@@ -134,8 +134,8 @@ def test_a_users_configuration_may_be_a_plain_or_a_pydantic_dataclass(kind: type
     assert type(made) is kind and (made.sizes, made.corners, made.limit) == ((4,), ((1.0, 2.0),), 3.0)
     assert (made.camera.width, made.camera.fov, made.rewards, made.ppo.steps) == (8, 0.5, {"near": 2.0}, 7)
     for overrides, said in (
-        ({"sizes": [4, "x"]}, "sizes.1: expected a whole number, found a text ('x')"),
-        ({"limit": "low"}, "limit: expected a number, found a text ('low')"),
+        ({"sizes": [4, "x"]}, "sizes.1: expected an integer, found a string ('x')"),
+        ({"limit": "low"}, "limit: expected a number, found a string ('low')"),
         ({"limit": 0}, "limit: 0 leaves no room"),
         ({"camera": {"fov": 4}}, "camera.fov: expected a value less than 3.141592653589793, found 4"),
         ({"ppo": {"steps": 8}}, f"ppo: not a key of {kind.__name__}; settings of ppo stand under train.ppo"),

@@ -124,7 +124,7 @@ def _check_numbers(found: Any, section: dict[str, Any]) -> None:
             continue
         kind = int if isinstance(default, int) and name != "grad_reduce_bucket_mb" else int | float
         if not isinstance(value, kind) or isinstance(value, bool):
-            expected = "a whole number" if kind is int else "a number"
+            expected = "an integer" if kind is int else "a number"
             raise ValueError(f"rsl_rl.algorithm.{name}: expected {expected}, found {kind_of(value)}")
 
 

@@ -311,7 +311,7 @@ class CameraSensor(SensorDeclaration):
         for name, greatest in (("width", 1024), ("height", 1024), ("frames", 16), ("samples", 64)):
             value = getattr(self, name)
             if not isinstance(value, int) or not 1 <= value <= greatest:
-                raise ValueError(f"CameraSensor.{name}: expected a whole number from 1 to {greatest}, found {value!r}")
+                raise ValueError(f"CameraSensor.{name}: expected an integer from 1 to {greatest}, found {value!r}")
         if not 0.0 < self.fov < math.pi:
             raise ValueError(f"CameraSensor.fov: expected an angle between 0 and pi [rad], found {self.fov!r}")
         if not 0.0 <= self.near < self.far < math.inf:

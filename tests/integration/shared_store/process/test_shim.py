@@ -193,10 +193,10 @@ def test_an_unkillable_process_is_named_and_waited_for(pids: Path, monkeypatch: 
         wait_for(lambda: node.shim and node.shim.name == STUCK, 20, "the shim says that it is stuck")
     assert shim.wait(20 * PATIENCE) == 137
     assert shim.stderr is not None
-    said = shim.stderr.read()
+    message = shim.stderr.read()
     wait = "in an uninterruptible wait"
-    assert said.startswith(f"muster: SIGKILL does not end process {stubborn} (sleep), state D: {wait}")
-    assert said.count("\n") == 1, "said once"
+    assert message.startswith(f"muster: SIGKILL does not end process {stubborn} (sleep), state D: {wait}")
+    assert message.count("\n") == 1, "said once"
 
 
 CHAIN = """

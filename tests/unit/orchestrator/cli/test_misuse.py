@@ -29,7 +29,7 @@ MISUSE = {
     "logs": "JOB is missing; see: muster logs --help",
     "models register x": "--name is missing; see: muster models register --help",
     "queues a b": "b: more arguments than the command takes; see: muster queues show --help",
-    "evaluate x --episodes ten": "--episodes: expected a whole number, found ten; see: muster evaluate --help",
+    "evaluate x --episodes ten": "--episodes: expected an integer, found ten; see: muster evaluate --help",
     "run x --cpus many": "--cpus: expected a number, found many; see: muster run --help",
     "serve --port 70000": (
         "--port: expected a value less than or equal to 65535, found '70000'; see: muster serve --help"

@@ -79,5 +79,5 @@ def test_an_error_has_its_key_and_its_line() -> None:
     found = problem_of("job.yaml:9: train.config.camera.width: expected", JOB)
     assert found == SubmissionProblem("expected", "train.config.camera.width", 9)
     assert problem_of("job.yaml:3: not valid YAML: what", JOB) == SubmissionProblem("not valid YAML: what", "", 3)
-    assert problem_of("job.yaml: expected a mapping", "") == SubmissionProblem("expected a mapping")
+    assert problem_of("job.yaml: expected an object", "") == SubmissionProblem("expected an object")
     assert problem_of("something: else", "") == SubmissionProblem("something: else")

@@ -49,7 +49,7 @@ SHORT = "whsec_c2hvcnQ="
         ({"url": "file:///etc/passwd"}, "chat.url: expected a URL such as https://chat.example/hooks/muster"),
         ({"secret": SHORT}, "chat.secret: expected whsec_ and 24 to 64 random bytes in base64"),
         ({"secret": SECRET.removeprefix("whsec_")}, "chat.secret: expected whsec_ and 24 to 64 random bytes"),
-        ({"secret": 7}, "chat.secret: expected a text"),
+        ({"secret": 7}, "chat.secret: expected a string"),
         ({"secrt": "x"}, "chat.secrt: unknown key; valid here: url, secret, statuses, queues, kinds, link"),
         ({"statuses": ["DONE"]}, "chat.statuses"),
     ],

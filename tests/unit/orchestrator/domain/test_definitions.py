@@ -101,7 +101,7 @@ def test_options_and_spec_are_those_of_the_main_node() -> None:
     assert spec.options.is_native and spec.spec == {"name": "ant"} and spec.nodes[0].spec is None
     assert spec.nodes[1].environment["EMPTY"] == ""
     assert gang_needs(definition(("0:", {}))).spec is None
-    with pytest.raises(ValueError, match="MUSTER_SPEC is not a mapping"):
+    with pytest.raises(ValueError, match="MUSTER_SPEC is not an object"):
         _ = gang_needs(definition(("0:", variables(MUSTER_SPEC="[]")))).spec
 
 

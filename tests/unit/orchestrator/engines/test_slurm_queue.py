@@ -163,5 +163,5 @@ def test_the_settings_are_checked(cluster: Cluster) -> None:
         with pytest.raises(SpecError, match=words):
             _squeue_interval(text, engines)
     check_tags({"muster:cancellations": "5"}, ["slurm"])
-    with pytest.raises(ValueError, match="not a whole number"):
+    with pytest.raises(ValueError, match="not an integer"):
         check_tags({"muster:cancellations": "often"}, ["slurm"])

@@ -143,7 +143,7 @@ WRONG_TRACKING = {
     ),
     "secrets: {KEY: ''}": "secrets: 'KEY': expected the name under which the controller has the value",
     "{secrets: {KEY: x}, environment: {KEY: y}}": "secrets: KEY is in environment, too; give it once",
-    "secrets: {KEY: 3}": "secrets.KEY: expected a text, found a whole number (3)",
+    "secrets: {KEY: 3}": "secrets.KEY: expected a string, found an integer (3)",
 }
 
 

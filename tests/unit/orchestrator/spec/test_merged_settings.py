@@ -55,15 +55,15 @@ def job(path: Path, task: str, algorithm: str, settings: str) -> str:
     ("algorithm", "key", "value", "said"),
     [
         ("ppo", "hidden_sizes", [], "hidden_sizes: expected at least one number, found []"),
-        ("ppo", "epochs", 2.5, "epochs: expected a whole number, found a number (2.5)"),
+        ("ppo", "epochs", 2.5, "epochs: expected an integer, found a number (2.5)"),
         ("ppo", "schedule", "linear", "schedule: expected 'adaptive' or 'fixed', found 'linear'"),
         ("sac", "gamma", 2.0, "gamma: expected a value less than or equal to 1, found 2.0"),
-        ("rsl_rl", "actor", [64], "actor: expected a mapping, found a list"),
+        ("rsl_rl", "actor", [64], "actor: expected an object, found a list"),
         ("rsl_rl", "actor", {"init": math.inf}, "actor.init: expected a finite number, found a number (inf)"),
         ("rsl_rl", "algorithm", {"max_grad_norm": None}, "algorithm.max_grad_norm: expected a number, found nothing"),
         (
             *("rsl_rl", "algorithm", {"num_mini_batches": 2.5}),
-            "algorithm.num_mini_batches: expected a whole number, found a number (2.5)",
+            "algorithm.num_mini_batches: expected an integer, found a number (2.5)",
         ),
     ],
 )
@@ -180,7 +180,7 @@ def test_an_algorithm_of_an_installed_package_is_known_to_the_submission_and_to_
     assert done.stdout.splitlines() == [
         "{'hops': 4}",
         "job.yaml: train.hop.hopps: unknown key; did you mean hops?",
-        "job.yaml: train.hop.hops: expected a whole number, found a text ('many')",
+        "job.yaml: train.hop.hops: expected an integer, found a string ('many')",
         "job.yaml: train.ppo: the algorithm is hop, so its settings belong under train.hop",
         "job.yaml: train.config.hop: not a key of CartpoleConfig; settings of hop stand under train.hop",
     ], done.stderr

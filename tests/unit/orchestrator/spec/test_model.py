@@ -51,9 +51,9 @@ RUN_LETTERS = "expected letters, digits, '.', '_' and '-', starting with a lette
 TASKS = ", ".join(known_tasks())
 TOP = ", ".join(Spec.model_fields)
 
-NODES = "expected a whole number of nodes, or {min: 2, max: 4}"
+NODES = "expected an integer number of nodes, or {min: 2, max: 4}"
 ONE_OF = f"expected exactly one of {', '.join(KINDS)}; found"
-MAPPING = "expected a mapping of keys such as name, nodes, train; found"
+MAPPING = "expected an object of keys such as name, nodes, train; found"
 LINES = {
     "checkpoint: {evry: 1}": "checkpoint.evry: unknown key; did you mean every?",
     "checkpoint: {whatever: 1}": "checkpoint.whatever: unknown key; did you mean every?",
@@ -66,18 +66,18 @@ LINES = {
     "nodes: 0": "nodes.min: expected a value greater than or equal to 1, found 0 (and 1 more)",
     "nodes: 5001": "nodes.min: expected a value less than or equal to 5000, found 5001 (and 1 more)",
     "nodes: {min: 3, max: 2}": "nodes: min (3) is more than max (2)",
-    "resources: 3": "resources: expected a mapping, found a whole number (3)",
+    "resources: 3": "resources: expected an object, found an integer (3)",
     "resources: {memory: 1MiB}": "resources.memory: expected a value greater than or equal to 4, found 1",
-    "resources: {memory: 4.5}": "resources.memory: expected a whole number, found a number (4.5)",
+    "resources: {memory: 4.5}": "resources.memory: expected an integer, found a number (4.5)",
     "resources: {cpus: 0}": "resources.cpus: expected a value greater than 0, found 0",
     "resources: {cpus: .inf}": "resources.cpus: expected a finite number, found a number (inf)",
     "timeout: soon": "timeout: expected a duration such as 90s, 45m, 2h or 1d, found 'soon'",
     "timeout: 5s": "timeout: expected a value greater than or equal to 60, found '5s'",
     "timeout: true": "timeout: expected a number, found true or false (True)",
-    "retry: {attempts: '3'}": "retry.attempts: expected a whole number, found a text ('3')",
+    "retry: {attempts: '3'}": "retry.attempts: expected an integer, found a string ('3')",
     "on_child_failure: resart": "on_child_failure: expected 'restart', 'fail' or 'ignore', found 'resart'",
     "checkpoint: {keep: 1}": "checkpoint.keep: expected a value greater than or equal to 2, found 1",
-    "environment: [a]": "environment: expected a mapping, found a list",
+    "environment: [a]": "environment: expected an object, found a list",
     "environment: {MUSTER_X: a}": (
         "environment: MUSTER_X is reserved; names that start with AWS_BATCH or MUSTER_ are set by Muster"
     ),
@@ -90,10 +90,10 @@ PPO = {
     "learning_rat: 1.0": "learning_rat: unknown key; did you mean learning_rate?",
     "schedule: adaptiv": "schedule: expected 'adaptive' or 'fixed', found 'adaptiv'",
     "gamma: 1.5": "gamma: expected a value less than or equal to 1, found 1.5",
-    "hidden_sizes: 64": "hidden_sizes: expected a list, found a whole number (64)",
-    "normalize_observations: 'yes'": "normalize_observations: expected true or false, found a text ('yes')",
-    "learning_rate: 5e-4": "learning_rate: expected a number, found a text ('5e-4'); in YAML it is written 5.0e-4",
-    "learning_rate: 1.5e3": "learning_rate: expected a number, found a text ('1.5e3'); in YAML it is written 1.5e+3",
+    "hidden_sizes: 64": "hidden_sizes: expected a list, found an integer (64)",
+    "normalize_observations: 'yes'": "normalize_observations: expected true or false, found a string ('yes')",
+    "learning_rate: 5e-4": "learning_rate: expected a number, found a string ('5e-4'); in YAML it is written 5.0e-4",
+    "learning_rate: 1.5e3": "learning_rate: expected a number, found a string ('1.5e3'); in YAML it is written 1.5e+3",
     "learning_rate: .nan": "learning_rate: expected a finite number, found a number (nan)",
 }
 """Of settings of ppo."""
@@ -113,7 +113,7 @@ FILES: dict[str, str] = {
     "name: a\nevaluate: {run: x, checkpont: 3}\n": ":2: evaluate.checkpont: unknown key; did you mean checkpoint?",
     "": f": {MAPPING} nothing",
     "- a\n": f": {MAPPING} a list",
-    "text": f": {MAPPING} a text ('text')",
+    "text": f": {MAPPING} a string ('text')",
     "command: [x]\n": ": name: is required",
     "name: a\n": f": {ONE_OF} none",
     f"name: a\ncommand: [x]\n{TRAIN}\n": f": {ONE_OF} train and command",
@@ -125,13 +125,13 @@ FILES: dict[str, str] = {
     ),
     "name: a b\ncommand: [x]\n": f":1: name: {LETTERS}, found 'a b'",
     f"name: {'a' * 101}\ncommand: [x]\n": f":1: name: {LETTERS}, found '{'a' * 56}…",
-    "name: 7\ncommand: [x]\n": ":1: name: expected a text, found a whole number (7)",
-    "name: on\ncommand: [x]\n": ":1: name: expected a text, found true or false (True)",
-    "name: a\ncommand: python x\n": ":2: command: expected a list, found a text ('python x')",
-    "name: a\ncommand:\n  - python\n  - 3\n": ":4: command.1: expected a text, found a whole number (3)",
-    'name: a\ncommand: [x, "a\\0b"]\n': ":2: command.1: expected a text without a zero byte, found 'a\\x00b'",
-    "name: a\ncommand: [x]\nenvironment:\n  A: 1\n": ":4: environment.A: expected a text, found a whole number (1)",
-    "name: a\ntrain: Cartpole\n": ":2: train: expected a mapping, found a text ('Cartpole')",
+    "name: 7\ncommand: [x]\n": ":1: name: expected a string, found an integer (7)",
+    "name: on\ncommand: [x]\n": ":1: name: expected a string, found true or false (True)",
+    "name: a\ncommand: python x\n": ":2: command: expected a list, found a string ('python x')",
+    "name: a\ncommand:\n  - python\n  - 3\n": ":4: command.1: expected a string, found an integer (3)",
+    'name: a\ncommand: [x, "a\\0b"]\n': ":2: command.1: expected a string without a zero byte, found 'a\\x00b'",
+    "name: a\ncommand: [x]\nenvironment:\n  A: 1\n": ":4: environment.A: expected a string, found an integer (1)",
+    "name: a\ntrain: Cartpole\n": ":2: train: expected an object, found a string ('Cartpole')",
     "name: a\ntrain: {task: Cartpoel, worlds: 4, iterations: 2}\n": (
         f":2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class; {OF_PLUGIN})"
     ),

@@ -34,14 +34,14 @@ WRONG = {
     "Cartpole rewards: {xyz: 1.0}": "rewards.xyz: the task has no term 'xyz'; there are alive, angle, position",
     "CartpolePixels camera: {witdh: 32}": "camera.witdh: CameraConfig has no such key; did you mean width?",
     # another type
-    "Ant fall_height: low": "fall_height: expected a number, found a text ('low')",
-    "Ant fall_height: 3e-1": "fall_height: expected a number, found a text ('3e-1'); in YAML it is written 3.0e-1",
+    "Ant fall_height: low": "fall_height: expected a number, found a string ('low')",
+    "Ant fall_height: 3e-1": "fall_height: expected a number, found a string ('3e-1'); in YAML it is written 3.0e-1",
     "Ant fall_height: true": "fall_height: expected a number, found true or false (True)",
     "Ant fall_height: null": "fall_height: expected a number, found nothing",
-    "Quadruped substeps: 1.5": "substeps: expected a whole number, found a number (1.5)",
-    "Ant rewards: [1.0]": "rewards: expected a mapping, found a list",
-    "Ant rewards: {up: 1, fall: high}": "rewards.fall: expected a number, found a text ('high')",
-    "Ant randomize: 3": "randomize: expected a mapping, found a whole number (3)",
+    "Quadruped substeps: 1.5": "substeps: expected an integer, found a number (1.5)",
+    "Ant rewards: [1.0]": "rewards: expected an object, found a list",
+    "Ant rewards: {up: 1, fall: high}": "rewards.fall: expected a number, found a string ('high')",
+    "Ant randomize: 3": "randomize: expected an object, found an integer (3)",
     # out of range
     "Ant control_hz: 0": "control_hz: expected a value greater than 0, found 0",
     "Cartpole substeps: 0": "substeps: expected a value greater than or equal to 1, found 0",
@@ -55,7 +55,7 @@ WRONG = {
     "CartpolePixels camera: {samples: 65}": "camera.samples: expected a value less than or equal to 64, found 65",
     "CartpolePixels camera: {target: [0, 1]}": "camera.target: expected [x, y, z], found [0, 1]",
     # weights
-    "Ant rewards: {7: 1.0}": "rewards.7: expected a text, found a whole number (7)",
+    "Ant rewards: {7: 1.0}": "rewards.7: expected a string, found an integer (7)",
     "Ant rewards: {forward: true}": "rewards.forward: expected a number, found true or false (True)",
     "Ant rewards: {forward: .nan}": "rewards.forward: expected a finite number, found a number (nan)",
     "Ant rewards: {up: .inf}": "rewards.up: expected a finite number, found a number (inf)",
@@ -110,7 +110,7 @@ def test_the_line_is_that_of_the_value_and_a_change_has_none(tmp_path: Path) -> 
         load(str(path))
     path.write_text("name: a\ntrain: {task: Ant, worlds: 4, iterations: 2}\n")
     said = refusal(load, str(path), ["train.config.fall_height=low"], error=SpecError)
-    assert said == "--set: train.config.fall_height: expected a number, found a text ('low')"
+    assert said == "--set: train.config.fall_height: expected a number, found a string ('low')"
 
 
 def test_every_installed_task_publishes_the_class_that_its_rank_uses() -> None:
@@ -200,7 +200,7 @@ def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_task_of_an_installed_package_is_checked_by_the_class_that_it_names() -> None:
     submit("Reach", {"reach": 1, "rewards": {"near": 2}})
     for config, said in (
-        ({"reach": "far"}, "reach: expected a number, found a text ('far')"),
+        ({"reach": "far"}, "reach: expected a number, found a string ('far')"),
         ({"rewards": {"nera": 1}}, "rewards.nera: the task has no term 'nera'; did you mean near?"),
         ({"substeps": 0}, "substeps: expected a value greater than or equal to 1, found 0"),
     ):

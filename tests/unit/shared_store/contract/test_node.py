@@ -85,8 +85,8 @@ def test_rank_zero_is_on_the_main_node_whatever_its_index_and_the_others_get_its
     given = [node.to_env() for node in nodes]
     assert [node.node_rank for node in nodes] == ranks == [int(env["NODE_RANK"]) for env in given]
     assert {(env["MASTER_ADDR"], env["MASTER_PORT"], env["NNODES"]) for env in given} == {("127.64.0.1", "29500", "4")}
-    told = [env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") for env in given]
-    assert told == [None if index == main else "127.64.0.1" for index in range(4)]
+    result = [env.get("AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS") for env in given]
+    assert result == [None if index == main else "127.64.0.1" for index in range(4)]
 
 
 def test_our_own_variables_name_the_job_the_run_and_the_attempt() -> None:
@@ -112,7 +112,7 @@ WHOLE = ("AWS_BATCH_JOB_ATTEMPT", "AWS_BATCH_JOB_NODE_INDEX", "MASTER_PORT", "MU
 MALFORMED = [
     *((name, {name: ""}, MISSING) for name in ("MUSTER_JOB_ID", "MUSTER_RUN", "MUSTER_STORE", "MUSTER_EPOCH")),
     *(
-        (name, {name: v}, f"{v!r}, not a whole number; ")
+        (name, {name: v}, f"{v!r}, not an integer; ")
         for name in WHOLE
         for v in ("two", "1.5", "--5", "²", "1_000", " 1")
     ),
@@ -124,11 +124,13 @@ MALFORMED = [
 ]
 
 
-@pytest.mark.parametrize(("name", "change", "said"), MALFORMED)
-def test_a_missing_or_malformed_variable_is_named_with_its_value(name: str, change: dict[str, str], said: str) -> None:
+@pytest.mark.parametrize(("name", "change", "message"), MALFORMED)
+def test_a_missing_or_malformed_variable_is_named_with_its_value(
+    name: str, change: dict[str, str], message: str
+) -> None:
     whole = contract().to_env()
-    for env in ({**whole, **change}, *([{k: v for k, v in whole.items() if k != name}] if said == MISSING else [])):
-        assert refusal(NodeContract.from_env, env, error=ContractError).startswith(f"{name} is {said}")
+    for env in ({**whole, **change}, *([{k: v for k, v in whole.items() if k != name}] if message == MISSING else [])):
+        assert refusal(NodeContract.from_env, env, error=ContractError).startswith(f"{name} is {message}")
 
 
 def test_optional_variables_have_defaults_and_a_single_node_job_has_none_of_nodes() -> None:

@@ -51,17 +51,13 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         (lambda: Plugin(folders="tally"), "folders: expected a tuple, found 'tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(folders=(3,)), "folders: expected the name of a folder, of letters, digits, '_' and '-', found 3"),  # type: ignore[arg-type]
         (lambda: Plugin(folders=("../x",)), "folders: expected the name of a folder, of letters, digits, '_' and '-', found '../x'"),
-        (lambda: Plugin(folders=("plugins.json",)), "folders: expected the name of a folder, of letters, digits, '_' and '-', found 'plugins.json'"),
         (lambda: Plugin(folders=("runs",)), "folders: runs is a folder of Muster's own; choose another name"),
         (lambda: Plugin(run_folders=("logs",)), "run_folders: logs is a folder of Muster's own; choose another name"),
         (lambda: Plugin(operations=("FETCH api/tally",)), "operations: expected METHOD /path, such as GET /api/notes, found 'FETCH api/tally'"),
-        (lambda: Plugin(operations="GET /api/tally"), "operations: expected a tuple, found 'GET /api/tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(routers=("tally.routes",)), "routers: expected module:name, found 'tally.routes'"),
-        (lambda: Plugin(navigation="/tally"), "navigation: expected a tuple, found '/tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(navigation=("Tally", "/tally")), "navigation: expected tuples of 2 texts, found 'Tally'"),  # type: ignore[arg-type]
         (lambda: Plugin(navigation=(("Tally", "tally"),)), "navigation: expected a path that begins with /, found 'tally'"),
         (lambda: Plugin(commands=(("tally", "m"),)), "commands: expected Command(…), found ('tally', 'm')"),  # type: ignore[arg-type]
-        (lambda: Plugin(sections=("race",)), "sections: expected JobSection(…), found 'race'"),  # type: ignore[arg-type]
         (lambda: Plugin(references=5), "references: expected module:name, found 5"),  # type: ignore[arg-type]
         (lambda: Plugin(templates="a b"), "templates: expected a module, such as package.module, found 'a b'"),
         (lambda: Command("Tally", "t.m", "Runs", "Count."), "Command.name: expected a name of lower-case letters, digits and '-', found 'Tally'"),
@@ -75,7 +71,7 @@ def test_a_field_of_another_form_is_refused_by_its_name(declare: Callable[[], ob
 def test_no_folder_is_one_of_the_layout(tmp_path: Path) -> None:
     store = Store(tmp_path)
     for owner, known in ((store, OF_STORE), (store.run("ant-1"), OF_RUN)):
-        paths = [getattr(owner, name) for name, each in vars(type(owner)).items() if isinstance(each, property)]
+        paths = [getattr(owner, name) for name in vars(type(owner)) if name != "path" and not name.startswith("__")]
         folders = {each.name for each in paths if isinstance(each, Path) and not each.suffix}
         assert folders and folders <= known
 
@@ -129,21 +125,19 @@ def test_of_two_copies_of_a_package_the_one_counts_that_comes_first_on_the_path(
     [
         ("raise SystemExit(3)", "tally:PLUGIN can't be imported (it exits with 3)"),
         ("1 / 0", "tally:PLUGIN can't be imported (division by zero)"),
-        ("raise ValueError", "tally:PLUGIN can't be imported (ValueError)"),
         ("PLUGIN = 3", "tally:PLUGIN is no Plugin of shared_store.contract.plugins"),
     ],
 )
 def test_a_plug_in_that_can_t_be_imported_is_one_line(folder: Path, line: str, words: str) -> None:
     write_package(folder, "tally", f"Plugin()\n{line}")
-    said = refusal(plugins, error=PluginError)
-    assert said.startswith(f"plug-in tally of the package tally: {words}") and "\n" not in said
+    message = refusal(plugins, error=PluginError)
+    assert message.startswith(f"plug-in tally of the package tally: {words}") and "\n" not in message
 
 
 @pytest.mark.parametrize(
     ("code", "kind", "words"),
     [
         ("", object, "can't be imported (module 'tally_parts' has no attribute 'part')"),
-        ("def broken(:", object, "can't be imported (invalid syntax (tally_parts.py, line 1))"),
         ("import sys; sys.exit('no')", object, "can't be imported (it exits with 'no')"),
         ("part = 3", str, "is int, and no str"),
     ],
@@ -152,8 +146,8 @@ def test_a_part_that_can_t_be_used_is_named_with_its_plug_in_and_field(
     folder: Path, code: str, kind: Any, words: str
 ) -> None:
     write_package(folder, "tally", "Plugin(references='tally_parts:part')", code)
-    said = refusal(load, "tally_parts:part", kind, error=PluginError)
-    assert said.startswith(f"plug-in tally: references: tally_parts:part {words}") and "\n" not in said
+    message = refusal(load, "tally_parts:part", kind, error=PluginError)
+    assert message.startswith(f"plug-in tally: references: tally_parts:part {words}") and "\n" not in message
 
 
 def test_rules_lack_nothing(folder: Path) -> None:

@@ -17,6 +17,7 @@ from shared_store.volume.checkpoints import (
     Checkpoint,
     CheckpointWriter,
     DamagedCheckpoint,
+    best_checkpoint,
     list_checkpoints,
     newest_checkpoint,
     retain,
@@ -65,9 +66,6 @@ def set_newest_aside(root: Path) -> None:
 
 def sweep_up(root: Path) -> None:
     sweep(Run(root))
-
-
-# -- commit -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_committed_checkpoint_lists_its_contents(run: Run) -> None:
@@ -161,9 +159,6 @@ def test_an_uncommitted_checkpoint_is_not_listed_and_one_that_is_gone_can_not_be
     assert list_checkpoints(run) == []
 
 
-# -- order and choice -------------------------------------------------------------------------------------------------
-
-
 def test_nothing_is_committed_into_the_mount_point_of_a_volume_that_is_gone(run: Run) -> None:
     writer = CheckpointWriter(run, 50, 1)
     away = run.path.rename(run.path.with_name("away"))
@@ -195,16 +190,12 @@ def test_a_chosen_checkpoint_stands_until_the_job_has_one_of_its_own(run: Run) -
 
 
 def test_a_choice_that_is_missing_or_damaged_is_never_replaced_by_a_guess(run: Run) -> None:
-    damaged = commit(run, 25)
-    commit(run, 50)
+    damaged, _ = commit(run, 25), commit(run, 50)
     with pytest.raises(DamagedCheckpoint, match="checkpoint 00000033-e1: not in run ant"):
         newest_checkpoint(run, chosen="00000033-e1", chosen_since=2)
     (damaged.path / "rank-0.pt").unlink()
     with pytest.raises(DamagedCheckpoint, match=r"00000025-e1: rank-0.pt is missing"):
         newest_checkpoint(run, chosen="00000025-e1", chosen_since=2)
-
-
-# -- damage -----------------------------------------------------------------------------------------------------------
 
 
 def edit(**changes: Any) -> Callable[[Path], Any]:
@@ -248,13 +239,14 @@ def nest(path: Path) -> None:
 
 ENTRY, UNREADABLE = "manifest.json has no size and digest of rank-0.pt", "manifest.json can't be read"
 ONE = {"size": 1, "sha256": "0"}
+STATE = {"size": 5, "sha256": hashlib.sha256(b"state").hexdigest()}
 DAMAGES = {
     "a bit flipped": (flip_a_bit, "the content of rank-1.pt was altered (SHA-256 differs)"),
     "a file cut short": (cut("rank-1.pt", 10), "rank-1.pt has 10 bytes, 1600 were written"),
     "a file emptied": (cut("learner.pt", 0), "learner.pt has 0 bytes, 1700 were written"),
     "a file deleted": (delete("rank-0.pt"), "rank-0.pt is missing"),
     "a file that is a pipe": (replace_by_pipe, "rank-0.pt is not a regular file"),
-    "no manifest": (delete("manifest.json"), "manifest.json is missing or empty"),
+    "no manifest": (delete("manifest.json"), "manifest.json is missing"),
     "an empty manifest": (cut("manifest.json", 0), UNREADABLE),
     "half a manifest": (cut("manifest.json", 40), UNREADABLE),
     "a manifest nested deep": (nest, UNREADABLE),
@@ -264,10 +256,17 @@ DAMAGES = {
         "manifest.json names '../../etc/passwd', which is no file of it",
     ),
     "a zero byte in a name": (edit(files={"a\0b": ONE}), r"manifest.json names 'a\x00b', which is no file of it"),
+    "a negative size": (edit(files={"rank-0.pt": {**ONE, "size": -1}}), ENTRY),
+    "a size that is a truth value": (edit(files={"rank-0.pt": {**ONE, "size": True}}), ENTRY),
+    "a size that no volume has": (edit(files={"rank-0.pt": {**ONE, "size": 2**63}}), ENTRY),
+    "a digest that is a number": (edit(files={"rank-0.pt": {**ONE, "sha256": 7}}), ENTRY),
+    "a hidden name": (edit(files={".rank": ONE}), "manifest.json names '.rank', which is no file of it"),
+    "no format": (edit(format="1"), "manifest.json has no format"),
+    "worlds that are an object": (edit(worlds={}), "manifest.json: worlds is not a number"),
     "a size that is a text": (edit(files={"rank-0.pt": {"size": "x", "sha256": "0"}}), ENTRY),
     "half an entry": (edit(files={"rank-0.pt": {"size": 1600}}), ENTRY),
     "an entry that is none": (edit(files={"rank-0.pt": None}), ENTRY),
-    "a manifest without files": (edit(files=None), "manifest.json is missing or empty"),
+    "a manifest without files": (edit(files=None), "manifest.json lists no files"),
     "a reward that is a list": (edit(reward=[1]), "manifest.json: reward is not a number"),
     "a newer format": (
         edit(format=FORMAT + 1),
@@ -282,15 +281,20 @@ def test_damage_is_named_and_the_checkpoint_before_it_is_used(run: Run, damage: 
     commit(run, 25)
     harm(commit(run, 50).path)
     named: list[tuple[str, str]] = []
-    told = newest(run, damaged=lambda checkpoint, error: named.append((checkpoint.name, str(error))))
+    result = newest(run, damaged=lambda checkpoint, error: named.append((checkpoint.name, str(error))))
     [(name, message)] = named
-    assert (told, name) == ("00000025-e1", "00000050-e1")
+    assert (result, name) == ("00000025-e1", "00000050-e1")
     assert message.startswith(f"checkpoint 00000050-e1: {said}")
 
 
-def test_a_damaged_checkpoint_is_set_aside_under_a_name_of_its_own_and_not_deleted(run: Run) -> None:
+def test_a_damaged_checkpoint_is_set_aside_durably_under_a_name_of_its_own_and_not_deleted(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for expected in ("00000050-e1.damaged", "00000050-e1.damaged-2", "00000050-e1.damaged-3"):
-        moved = set_aside(commit(run, 50))
+        checkpoint, seen = commit(run, 50), durable_operations(monkeypatch)
+        moved = set_aside(checkpoint)
+        monkeypatch.undo()
+        assert seen == [("rename", str(moved)), ("fsync", str(run.checkpoints))]
         assert moved.name == expected and (moved / "rank-0.pt").exists() and list_checkpoints(run) == []
     commit(run, 50).verify()
 
@@ -301,9 +305,6 @@ def test_setting_aside_killed_at_any_step_loses_nothing(run: Run, tmp_path: Path
     for left in killed_at_every_step(set_newest_aside, run.path, tmp_path / "work"):
         found = {name for name in os.listdir(left / "checkpoints") if name.startswith("0")}
         assert found in ({"00000025-e1", "00000050-e1"}, {"00000025-e1", "00000050-e1.damaged"})
-
-
-# -- sweeping and retention -------------------------------------------------------------------------------------------
 
 
 def test_sweeping_deletes_only_leftovers_of_crashes(run: Run) -> None:
@@ -342,6 +343,7 @@ RETAINED: dict[str, tuple[list[dict[str, Any]], int | None, list[int]]] = {
         2,
         [20, 40, 50],
     ),
+    "the newest whatever is asked for": ([{}] * 3, 0, [30]),
     "all where all are to be kept": ([{}] * 4, None, [10, 20, 30, 40]),
     **{
         f"a reward of {reward} is never the best": (
@@ -362,15 +364,82 @@ def test_retention_keeps(run: Run, case: str) -> None:
     assert names(run) == [f"{iteration:08d}-e1" for iteration in kept]
 
 
-def test_retention_never_deletes_the_newest(run: Run) -> None:
-    commit(run, 10)
-    commit(run, 20)
-    assert retain(run, 0) == ["00000010-e1"] and names(run) == ["00000020-e1"]
-
-
 def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: Run) -> None:
     for iteration in (10, 20, 30):
         commit(run, iteration)
     (run.checkpoints / "00000010-e1" / "manifest.json").write_text("{")
     commit(run, 40, keep=2)
     assert names(run) == ["00000030-e1", "00000040-e1"]
+
+
+def test_the_best_has_the_greatest_score_that_is_a_number_and_of_equals_it_is_the_later(run: Run) -> None:
+    assert best_checkpoint(run) is None
+    commit(run, 1, reward=9.0)
+    assert best_checkpoint(run) is None
+    for iteration, score in ((2, -5.0), (3, 1), (4, 1.0), (5, 0.5), (6, None)):
+        commit(run, iteration, score=score)
+    assert best_checkpoint(run).iteration == 4
+    for name, text in (("2", '{"files": {}, "format": 1, "score": Infinity}'), ("4", "{")):
+        (run.checkpoints / f"0000000{name}-e1" / "manifest.json").write_text(text)
+    assert best_checkpoint(run).iteration == 3
+
+
+def test_checkpoints_that_were_saved_only_for_long_iterations_and_those_with_exports_are_kept_apart(run: Run) -> None:
+    for iteration, scheduled in ((1, True), (2, True), (3, True), (4, False), (5, False)):
+        commit(run, iteration, scheduled=scheduled)
+    assert [each.is_scheduled for each in list_checkpoints(run)] == [True, True, True, False, False]
+    (run.exports / "00000001-e1").mkdir(parents=True)
+    assert retain(run, 1) == ["00000002-e1", "00000004-e1"] and [each.iteration for each in list_checkpoints(run)] == [
+        1,
+        3,
+        5,
+    ]
+    (run.checkpoints / "00000005-e1" / "manifest.json").write_text("{")
+    assert list_checkpoints(run)[-1].is_scheduled
+
+
+def test_a_commit_takes_its_writers_digests_and_publishes_no_notes(run: Run) -> None:
+    writer = CheckpointWriter(run, 3, 2)
+    (writer.path / "rank-0.pt").write_bytes(b"state")
+    (writer.path / ".note").touch()
+    (writer.path / "manifest.json").write_text("of an earlier try")
+    existing = CheckpointWriter(run, 3, 2)
+    made = existing.commit({}, digests={"rank-0.pt": STATE})
+    made.verify()
+    assert sorted(os.listdir(made.path)) == ["manifest.json", "rank-0.pt"] and made.manifest["created"] > 1e9
+    assert (made.path.name, made.iteration, made.epoch) == ("00000003-e2", 3, 2)
+    again = CheckpointWriter(run, 4, 2)
+    (again.path / "manifest.json").write_text("of an earlier try")
+    assert again.commit({}).manifest["files"] == {}
+    with pytest.raises(FileNotFoundError):
+        CheckpointWriter(Run(run.path / "gone"), 1, 1)
+
+
+def test_a_commit_sweeps_what_is_older_than_itself(run: Run) -> None:
+    for iteration, epoch in ((9, 1), (4, 2), (5, 2), (6, 2), (1, 3)):
+        CheckpointWriter(run, iteration, epoch)
+    (run.checkpoints / ".LATEST.1.tmp").touch()
+    assert sorted(sweep(run, up_to=(2, 5))) == [
+        ".00000004-e2.tmp",
+        ".00000005-e2.tmp",
+        ".00000009-e1.tmp",
+        ".LATEST.1.tmp",
+    ]
+    commit(run, 7, epoch=2)
+    assert sorted(os.listdir(run.checkpoints)) == [".00000001-e3.tmp", "00000007-e2", "LATEST"]
+
+
+def test_an_attempt_that_lost_its_run_in_the_rename_prunes_nothing(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    commit(run, 1)
+    raise_epoch(run, 1)
+    rename = os.rename
+
+    def frozen(old: Path, new: Path) -> None:
+        rename(old, new)
+        raise_epoch(run, 2)
+
+    monkeypatch.setattr(os, "rename", frozen)
+    commit(run, 2, keep=1)
+    assert [each.iteration for each in list_checkpoints(run)] == [1, 2] and (
+        run.checkpoints / "LATEST"
+    ).read_text() == "00000001-e1\n"

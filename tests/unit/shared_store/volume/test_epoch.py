@@ -2,26 +2,30 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from pathlib import Path
 
 import pytest
 
+from shared_store.volume import epoch as module
 from shared_store.volume.epoch import (
     LARGEST_EPOCH,
     Claim,
     StaleEpoch,
     check_epoch,
     close_claim,
+    find_epoch,
     raise_epoch,
     read_claim,
     read_epoch,
     take_epoch,
 )
-from shared_store.volume.files import write_atomic
-from shared_store.volume.layout import Run
+from shared_store.volume.files import DamagedFile, write_atomic
+from shared_store.volume.layout import Run, StoreError
 from tests.support.shared_store.at_once import at_once
 from tests.support.shared_store.crashes import killed_at_every_step
+from tests.support.shared_store.operations import durable_operations
 
 
 @pytest.fixture
@@ -62,7 +66,7 @@ def test_a_damaged_epoch_is_named_with_its_value(run: Run, content: str) -> None
     with pytest.raises(ValueError) as refused:
         read_epoch(run)
     found = repr(content[:32])
-    assert str(refused.value) == f"{run.path}/EPOCH: expected a whole number of at most 15 digits, found {found}"
+    assert str(refused.value) == f"{run.path}/EPOCH: expected an integer of at most 15 digits, found {found}"
 
 
 def test_no_epoch_follows_the_largest(run: Run) -> None:
@@ -140,3 +144,62 @@ def test_a_claim_names_the_attempt_until_it_is_closed_and_its_number_stays_taken
     for damage in (b"{", b"[1]", b"[" * 5000, b'{"controller": 1}', b"\xff"):
         (run.path / "EPOCH.8").write_bytes(damage)
         assert read_claim(run, 8) is None
+
+
+def test_a_node_starts_on_the_volume_on_which_its_epoch_is_published(run: Run) -> None:
+    raise_epoch(run, 5)
+    find_epoch(run, 5, patience=0)
+    with pytest.raises(StaleEpoch, match="this attempt has epoch 4, the run now belongs to epoch 5"):
+        find_epoch(run, 4, patience=0)
+    with pytest.raises(StoreError, match="is not the controller's: run run has epoch 5 there, not 6") as caught:
+        find_epoch(run, 6, patience=0)
+    assert str(caught.value).startswith(f"store {run.path.parent.parent} on ")
+
+
+def test_a_node_looks_again_at_the_directories_until_its_epoch_is_there(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed: list[Path] = []
+
+    def sleep(seconds: float) -> None:
+        assert 0 < seconds < 1
+        raise_epoch(run, 7)
+
+    monkeypatch.setattr(module.time, "sleep", sleep)
+    monkeypatch.setattr(module.os, "listdir", lambda path: listed.append(path) or [])
+    find_epoch(run, 7)
+    assert listed[:2] == [run.path.parent, run.path]
+
+
+def test_the_last_64_claims_are_kept_and_other_files(run: Run) -> None:
+    for number in (1, 35, 36, 99):
+        (run.path / f"EPOCH.{number}").touch()
+    (run.path / "EPOCH.1.old").touch()
+    raise_epoch(run, 100)
+    kept = {"EPOCH", "EPOCH.1.old", "EPOCH.36", "EPOCH.99", "EPOCH.100"}
+    assert set(os.listdir(run.path)) == kept
+
+
+def test_a_number_is_durable_before_it_is_used(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = durable_operations(monkeypatch)
+    raise_epoch(run, 3, Claim("a", "job", 2))
+    claim, directory = ("fsync", str(run.path / "EPOCH.3")), ("fsync", str(run.path))
+    assert seen.index(claim) < seen.index(directory) < seen.index(("rename", str(run.path / "EPOCH")))
+    assert read_claim(run, 3) == Claim("a", "job", 2)
+    seen.clear()
+    close_claim(run, 3)
+    assert seen == [claim] and read_claim(run, 3) is None
+
+
+def test_a_run_that_is_a_link_is_neither_read_nor_claimed(run: Run, tmp_path: Path) -> None:
+    raise_epoch(run, 1)
+    link = Run(tmp_path / "link")
+    link.path.symlink_to(run.path)
+    for act in (
+        lambda: read_epoch(link),
+        lambda: raise_epoch(link, 2),
+        lambda: close_claim(link, 1),
+        lambda: take_epoch(link, 2, Claim("a", "job", 1)),
+    ):
+        with pytest.raises(DamagedFile):
+            act()

@@ -99,7 +99,7 @@ def test_retention_keeps_of_evaluations_that_keep_nothing_the_best_and_what_is_s
     assert retain(run, keep=1) == ["00000012-e1"]
     evaluations.keep_for_evaluation(run, "00000015-e1")
     assert retain(run, keep=1) == ["00000009-e1"], "one waits at a time"
-    evaluations.evaluation_is_over(run, "00000015-e1")
+    evaluations.release_from_evaluation(run, "00000015-e1")
     evaluate(run, "00000015-e1-1f2e3d4c", 8.0, keep=False)
     assert retain(run, keep=1) == ["00000003-e1"], "there is a better one"
     assert [each.iteration for each in list_checkpoints(run)] == [6, 15], "of the greatest score, the newest"
@@ -123,14 +123,14 @@ def test_one_line_tells_the_successes_of_a_task_that_declares_them_and_else_how_
 
 def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> None:
     few = {**FIGURES, "checkpoint": "00000003-e1", "episodes": 3, "success": 7, "causes": {"fall": 2}}
-    told = "\n".join(evaluations.lines(few))
-    assert "3 episodes of Cartpole, checkpoint 00000003-e1" in told and "success" not in told
+    result = "\n".join(evaluations.lines(few))
+    assert "3 episodes of Cartpole, checkpoint 00000003-e1" in result and "success" not in result
     config = {"randomize": {"friction": [0.4, 0.6]}, "curriculum": {}}
     share = {"share": 0.94, "low": 0.875, "high": 0.972}
     whole = {**few, "episodes": 100, "config": config, "success": share, "success_is": "it stands"}
-    told = "\n".join(evaluations.lines({**FIGURES, **whole}))
-    assert "with config.randomize.friction: [0.4, 0.6]" in told and "config.curriculum: {}" in told
-    assert " ".join(told.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
+    result = "\n".join(evaluations.lines({**FIGURES, **whole}))
+    assert "with config.randomize.friction: [0.4, 0.6]" in result and "config.curriculum: {}" in result
+    assert " ".join(result.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
     term = {"mean": 1.0, "low": 0.5, "high": 1.5, "std": 0.1}
     rows = list(
         evaluations.lines({**FIGURES, **whole, "rewards": {"track_angular_velocity": term}, "metrics": {"way": term}})

@@ -13,8 +13,6 @@ from shared_store.volume.files import (
     DamagedFile,
     read_json,
     remove_tree,
-    sync_directory,
-    sync_file,
     write_atomic,
     write_json,
 )
@@ -137,11 +135,3 @@ def test_json_that_is_no_regular_file_is_damaged_and_never_waited_for(tmp_path: 
         with pytest.raises(DamagedFile, match="not a regular file"):
             read_json(tmp_path / name)
     assert read_json(tmp_path / "other.json" / "below a file") is None
-
-
-def test_syncing_a_missing_file_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError):
-        sync_file(tmp_path / "missing")
-    (tmp_path / "file").write_bytes(OLD)
-    with pytest.raises(NotADirectoryError):
-        sync_directory(tmp_path / "file")

@@ -71,15 +71,15 @@ HARMS: dict[str, Callable[[Path], Any]] = {
 }
 
 
-@pytest.mark.parametrize("said", HARMS)
-def test_damage_is_found_before_the_copy_and_before_the_use(store: Store, said: str) -> None:
+@pytest.mark.parametrize("message", HARMS)
+def test_damage_is_found_before_the_copy_and_before_the_use(store: Store, message: str) -> None:
     source, run = list_checkpoints(store.run("source"))[-1], heir(store)
-    HARMS[said](run.parent / source.name / "learner.pt")
-    with pytest.raises(DamagedCheckpoint, match=said):
+    HARMS[message](run.parent / source.name / "learner.pt")
+    with pytest.raises(DamagedCheckpoint, match=message):
         parent_checkpoint(run)
     making = new(store)
-    HARMS[said](source.path / "learner.pt")
-    with pytest.raises(DamagedCheckpoint, match=f"00000003-e1: .*learner.pt .*{said}|learner.pt was altered"):
+    HARMS[message](source.path / "learner.pt")
+    with pytest.raises(DamagedCheckpoint, match=f"00000003-e1: .*learner.pt .*{message}|learner.pt was altered"):
         making.copy()
     making.discard()
     assert names(store) == ["heir", "source"]

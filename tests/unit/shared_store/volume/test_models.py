@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from shared_store.volume import bundles, models
-from shared_store.volume.bundles import DamagedBundle, publish, seal
+from shared_store.volume.bundles import DamagedBundle, seal
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run, Store
@@ -51,7 +51,7 @@ def test_a_sealed_bundle_verifies_and_lists_every_other_file(bundle: Path) -> No
 
 
 @pytest.mark.parametrize(
-    ("damage", "said"),
+    ("damage", "message"),
     [
         (lambda path: flip(path / "robot" / "arm.xml", 3), r"the content of robot/arm\.xml was altered"),
         (lambda path: (path / "policy.onnx").write_bytes(b"weight"), r"policy\.onnx has 6 bytes, 7 were written"),
@@ -63,9 +63,9 @@ def test_a_sealed_bundle_verifies_and_lists_every_other_file(bundle: Path) -> No
         (lambda path: (path / "manifest.json").write_text("{"), r"manifest\.json can't be read"),
     ],
 )
-def test_a_difference_is_named_in_one_line(bundle: Path, damage: Callable[[Path], Any], said: str) -> None:
+def test_a_difference_is_named_in_one_line(bundle: Path, damage: Callable[[Path], Any], message: str) -> None:
     damage(bundle)
-    with pytest.raises(DamagedBundle, match=said) as caught:
+    with pytest.raises(DamagedBundle, match=message) as caught:
         bundles.verify(bundle)
     assert "\n" not in str(caught.value)
 
@@ -157,8 +157,8 @@ def test_versions_count_up_and_existing_ones_stay(store: Store) -> None:
 def test_a_registered_checkpoint_is_registered_again_only_on_request(store: Store) -> None:
     run, checkpoint = exported(store)
     first = models.register(store, "ant", run, checkpoint, {}, again=False)
-    said = r"^the same checkpoint is ant@1 already; --again registers it once more$"
-    with pytest.raises(AlreadyRegistered, match=said):
+    message = r"^the same checkpoint is ant@1 already; --again registers it once more$"
+    with pytest.raises(AlreadyRegistered, match=message):
         models.register(store, "ant", run, checkpoint, {}, again=False)
     assert os.listdir(store.models / "ant") == ["1"], "nothing is made"
     assert models.register(store, "other", run, checkpoint, {}, again=False).reference == "other@1"
@@ -177,11 +177,11 @@ def register_five(path: str, number: str) -> list[int]:
 def test_processes_that_register_at_once_get_a_version_each(store: Store) -> None:
     exported(store)
     answers = at_once(register_five, [(str(store.path), number) for number in "0123"])
-    given = {version: str(number) for number, versions in enumerate(answers) for version in versions}
-    assert sorted(given) == list(range(1, 21)), "twenty versions, none of them twice"
+    values = {version: str(number) for number, versions in enumerate(answers) for version in versions}
+    assert sorted(values) == list(range(1, 21)), "twenty versions, none of them twice"
     for model in models.versions(store, "ant"):
         model.verify()
-        assert model.facts()["registered_by"] == given[model.version]
+        assert model.facts()["registered_by"] == values[model.version]
     assert sorted(os.listdir(store.models / "ant"), key=int) == [str(number) for number in range(1, 21)]
 
 
@@ -207,26 +207,6 @@ def test_the_leftovers_of_a_killed_registration_are_deleted_by_its_controller_s_
     left = [path.name for path in store.models.glob("*/.*")]
     assert [name.split(".")[1] for name in left] == ["b2"], "another controller's may go on"
     models.find(store, "ant").verify()
-
-
-def test_a_version_is_never_published_over_another(store: Store, tmp_path: Path) -> None:
-    exported(store)
-    model = register(store)
-    (tmp_path / "other").mkdir()
-    (tmp_path / "other" / "policy.onnx").write_bytes(b"worse")
-    with pytest.raises(FileExistsError):
-        publish(tmp_path / "other", model.path)
-    model.verify()
-
-
-@pytest.mark.parametrize("name", ["", ".", "..", "../ant", "a/b", ".hidden", "-x", "a b", "a@1", "ä", "x" * 129, "a\n"])
-def test_a_name_that_can_not_be_a_directory_is_refused(store: Store, name: str) -> None:
-    exported(store)
-    with pytest.raises(ModelError, match=r"^model name .*: use letters, digits"):
-        register(store, name)
-    with pytest.raises(ModelError):
-        models.find(store, name)
-    assert not store.models.exists()
 
 
 def test_damage_of_a_model_is_found(store: Store) -> None:

@@ -123,16 +123,16 @@ def test_directories_that_may_not_be_written_are_kept_where_they_are_and_removed
 
 def test_what_can_t_be_removed_is_named_and_the_rest_goes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     stuck, other = logged(store, "stuck"), logged(store, "other")
-    [there, _], _ = trash.throw_away(store, [stuck.path, other.path])
+    [existing, _], _ = trash.throw_away(store, [stuck.path, other.path])
     is_held = True
     remove = shutil.rmtree
 
     def held(path: Path, ignore_errors: bool = False) -> None:
-        if not (is_held and path == there):
+        if not (is_held and path == existing):
             remove(path, ignore_errors=ignore_errors)
 
     monkeypatch.setattr("shutil.rmtree", held)
-    assert trash.empty(store) == [there]
+    assert trash.empty(store) == [existing]
     is_held = False
     assert trash.empty(store) == []
 
@@ -181,18 +181,6 @@ def test_clones_pupils_models_and_entries_need_their_runs(store: Store) -> None:
     assert {("run", "heir", "model ant@1 is of it"), ("run", "source", "model ant@1 began with its weights")} <= needed(
         store
     )
-
-
-def test_what_can_t_be_read_is_named_since_it_may_need_any_run(store: Store) -> None:
-    add_run(store, "source")
-    (store.run("source").parent).mkdir()
-    (store.run("source").path / "run.json").write_text("{")
-    write(store.models / "ant" / "1" / "model.json", "{")
-    (store.models / "bee" / "1").mkdir(parents=True)
-    found, unreadable = references(store)
-    assert found == []
-    for part in ("run source", "model ant@1", "model bee@1"):
-        assert any(part in each.why for each in unreadable), (part, unreadable)
 
 
 def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
