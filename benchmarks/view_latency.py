@@ -114,7 +114,7 @@ class Marked(screen.Screen):
     frames_sent: dict[str, tuple[int, int, int]] = {}
     """By word: number of the step, when its row was read, when the frame was handed to Rerun [ns]."""
 
-    def show(self, shown: screen.Steps) -> None:
+    def show(self, shown: screen.ShownSteps) -> None:
         read = Timed.read
         super().show(shown)
         word = "".join(random.choices(string.ascii_letters, k=12))

@@ -82,7 +82,7 @@ def keep_old_names(names: Mapping[str, str], members: Mapping[str, str] | None =
 
 
 OLD_NAMES = {
-    "orchestrator.engines.toolkit.endings": "orchestrator.engines.toolkit.looks",
+    "orchestrator.engines.toolkit.endings": "orchestrator.engines.toolkit.statuses",
     "orchestrator.engines.toolkit.stopping": "orchestrator.engines.toolkit.waiting",
     "shared_store.cgroups": "shared_store.process.cgroups",
     "shared_store.checkpoints": "shared_store.volume.checkpoints",

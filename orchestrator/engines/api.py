@@ -389,7 +389,7 @@ class Engine(Protocol):
         """The nodes, by index, of each of these gangs, in the order of ``handles``; in few requests, however many gangs there are.
 
         A gang that can't be looked at has its error in its place and hides no other one; an error that is raised is all gangs'. An
-        engine that looks at one gang at a time uses :func:`orchestrator.engines.toolkit.looks.one_by_one`.
+        engine that looks at one gang at a time uses :func:`orchestrator.engines.toolkit.statuses.one_by_one`.
         """
         ...
 

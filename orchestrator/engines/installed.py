@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import EntryPoint, entry_points
 
 from orchestrator.engines.api import Engine, EngineError, EngineType, Option, Setting, Traits
-from orchestrator.engines.toolkit.looks import observing_several
+from orchestrator.engines.toolkit.statuses import observing_several
 from shared_store.contract.entry_points import clash
 from shared_store.contract.error_text import nearest
 

@@ -32,7 +32,7 @@ from orchestrator.engines.api import (
     Transient,
 )
 from orchestrator.engines.toolkit.backoff import Backoff
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 
 log = logging.getLogger("muster.engines")
 

@@ -15,7 +15,7 @@ import pytest
 from orchestrator.engines.api import EngineError
 from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.engines.ray.folder import Folder
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from shared_store import __version__
 from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import wait_for

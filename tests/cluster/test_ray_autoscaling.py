@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from tests.conftest import REPOSITORY, wait_for
 from tests.support.engines.ray_bench import RayBench
 from tests.support.engines.ray_cluster import RayCluster

@@ -9,7 +9,7 @@ import threading
 import time
 from pathlib import Path
 
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import MUSTER, PATIENCE, Serving, wait_for

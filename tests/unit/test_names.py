@@ -21,7 +21,7 @@ MODULES = {
     "the settings of a thing, and the thing": "actions camera cartpole lift quadruped running sac task velocity",
     "a robot, and the task for it": "g1 go1",
     "the same part of several engines, or an engine's view of what the domain and the contract define": """
-        engine gang gangs node request""",
+        engine gang gangs node""",
     "a contract, and those who keep it": "algorithm bus policy",
     "values, and what makes or shows them": "job snapshot",
     "the same kind of thing in separate rooms": "episodes errors networks picture progress reasons requests",

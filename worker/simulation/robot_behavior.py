@@ -1,4 +1,4 @@
-"""What a built robot does otherwise than its file though no field of its model shows it: contacts, accelerations, softness.
+"""Behavior of a built robot that differs from its file though no field of its model shows it: contacts, accelerations, softness.
 
 Contacts that the rules of Newton and MuJoCo-Warp change are noted and not refused.
 """

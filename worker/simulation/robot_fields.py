@@ -1,4 +1,4 @@
-"""The values of the elements of a compiled model: what makes a robot the one that it is, for its judge and for its identity."""
+"""Fields of the elements of a compiled model: what makes a robot the one that it is, for its judge and for its identity."""
 
 from __future__ import annotations
 

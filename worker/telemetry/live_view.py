@@ -76,12 +76,12 @@ class WorldsView:
 
     def _draw(self, screen: Screen, rows: Rows, number: int) -> None:
         """Show the newest of some rows, control step ``number``."""
-        from worker.telemetry.screen import Steps
+        from worker.telemetry.screen import ShownSteps
 
         poses = self._stage.pose(rows.coordinates[-1])[None]
         images = {camera: {0: seen} for camera, seen in rows.pictures(-1).items()}
         now, rewards = np.array([time.time_ns()]), rows.terms[-1:].mean(1)
-        screen.show(Steps(now, np.array([number]), poses, rewards, self._iteration, images))
+        screen.show(ShownSteps(now, np.array([number]), poses, rewards, self._iteration, images))
         self.frames += 1
 
 

@@ -18,7 +18,7 @@ from worker.settings.errors import UserError
 from worker.telemetry import messages
 from worker.telemetry.intact_records import SoundRecords
 from worker.telemetry.recording import PARTIAL
-from worker.telemetry.screen import Appearance, Steps
+from worker.telemetry.screen import Appearance, ShownSteps
 
 BATCH = 256
 """Control steps that are handed out together."""
@@ -84,7 +84,7 @@ class Replay:
         what = "it ends before the first control step" if self.cut else "it has no control steps of Muster's recordings"
         raise UserError(f"{path}: {what}; `rerun {path.name}` shows what else is in it")
 
-    def parts(self) -> Iterator[Steps]:
+    def parts(self) -> Iterator[ShownSteps]:
         """All control steps, in order."""
         found = _Gathered(self.look)
         with self._own_messages():
@@ -159,7 +159,7 @@ class _Gathered:
         default_factory=lambda: defaultdict(lambda: defaultdict(list))
     )
 
-    def part(self, first: int) -> Steps:
+    def part(self, first: int) -> ShownSteps:
         """The steps, numbered from ``first``; those without an image of every world have none."""
         rewards = [np.mean(each, 0) if each else np.zeros(len(self.look.terms)) for each in self.rewards]
         worlds, count = len(self.look.places), len(self.times)
@@ -172,7 +172,7 @@ class _Gathered:
             for camera, steps in self.images.items()
         }
         arrays = np.array(self.times), np.arange(first, first + count), np.array(self.poses), np.array(rewards)
-        return Steps(*arrays, images=images, log=self.log, returns=self.returns)
+        return ShownSteps(*arrays, images=images, log=self.log, returns=self.returns)
 
     def move(self, time: int, transforms: list[Any]) -> None:
         parts = [(each.transform.translation, each.transform.rotation) for each in transforms]

@@ -57,7 +57,7 @@ class Appearance:
 
 
 @dataclass(frozen=True)
-class Steps:
+class ShownSteps:
     """Consecutive control steps of the worlds.
 
     Attributes:
@@ -93,14 +93,14 @@ class Screen:
 
     def __init__(self, server: str | Path, title: str, look: Appearance, live: bool) -> None:
         self._look, self._live, self._is_aimed = look, live, False
-        self._pending: list[Steps] = []
+        self._pending: list[ShownSteps] = []
         """Those whose reward terms are not sent yet."""
         self._rr = rr.RecordingStream("muster")
         self._rr.set_sinks(rr.FileSink(server) if isinstance(server, Path) else rr.GrpcSink(server))
         self._rr.send_recording_name(title)
         self._log_fixed()
 
-    def show(self, shown: Steps) -> None:
+    def show(self, shown: ShownSteps) -> None:
         """Show control steps; with the first of all, the eye is placed."""
         count, placed = len(shown.times), self._placed(shown.poses)
         if not self._is_aimed:

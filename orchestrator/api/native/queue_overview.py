@@ -91,7 +91,8 @@ def overview(controller: Controller, actor: Actor, only: str = "") -> dict[str, 
         "engines": _engines(controller, capacities),
         "hosts": [
             {
-                **{key: value for key, value in asdict(host).items() if key in ("name", "cpus", "memory", "away")},
+                **{key: value for key, value in asdict(host).items() if key in ("name", "cpus", "memory")},
+                "away": host.unavailable,
                 "engine": engine_of(host.name),
                 "gpus": len(host.gpus),
                 "inUse": asdict(taken.get(host.name, Resources())),

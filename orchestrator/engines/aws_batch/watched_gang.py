@@ -11,8 +11,8 @@ from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.domain.job import AWS_NOT_STARTED, TERMINAL
 from orchestrator.engines.api import Cause, GangStatus, Handle, Look, NodePhase, NodeStatus
 from orchestrator.engines.aws_batch.logs import CopiedLog, GangLogs
-from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.outcomes import record, recorded, seen
+from orchestrator.engines.toolkit.statuses import ended, one_by_one
 from shared_store.contract.error_text import counted
 from shared_store.volume.node_outcomes import EX_TEMPFAIL, Outcome
 

@@ -50,8 +50,8 @@ from orchestrator.engines.docker.answers import answered, unanswered
 from orchestrator.engines.docker.logs import FollowedLog
 from orchestrator.engines.docker.request import GANG, NODE, PLAIN, STORE, ContainerRequest, container_request
 from orchestrator.engines.toolkit.gpus import visible_gpus
-from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.outcomes import log_of, record, recorded, seen, store_facts
+from orchestrator.engines.toolkit.statuses import ended, one_by_one
 from orchestrator.engines.toolkit.waiting import stop_within
 from shared_store import __version__
 from shared_store.contract.error_text import counted

@@ -40,8 +40,8 @@ from orchestrator.engines.local import TRAITS
 from orchestrator.engines.local.gangs import parent_of
 from orchestrator.engines.toolkit.environment import inherited, node_environment, supervised
 from orchestrator.engines.toolkit.gpus import visible_gpus
-from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
+from orchestrator.engines.toolkit.statuses import ended, one_by_one
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.process.cgroups import own_group, remove_abandoned_groups
 from shared_store.process.memory_groups import memory_group, memory_home

@@ -42,8 +42,8 @@ from orchestrator.engines.ray import TRAITS
 from orchestrator.engines.ray.cluster import ClusterWatch, address_towards, grows_to, ray_environment
 from orchestrator.engines.ray.folder import LEASE, NEW, UNSTARTED, Folder
 from orchestrator.engines.ray.placement_groups import GangRequest, NodeRequest, in_words
-from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
+from orchestrator.engines.toolkit.statuses import ended, one_by_one
 from orchestrator.engines.toolkit.waiting import stop_within
 from shared_store.process.ports import first_port
 from shared_store.volume.files import read_json, write_json

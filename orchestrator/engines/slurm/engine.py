@@ -49,8 +49,8 @@ from orchestrator.engines.slurm.slurm_commands import (
     list_jobs,
 )
 from orchestrator.engines.slurm.states import CANCELLED, OVER, QUEUED, ending, waiting
-from orchestrator.engines.toolkit.looks import ended, one_by_one
 from orchestrator.engines.toolkit.outcomes import all_recorded, store_facts
+from orchestrator.engines.toolkit.statuses import ended, one_by_one
 from orchestrator.engines.toolkit.view import CachedView
 from orchestrator.engines.toolkit.waiting import stop_within
 from shared_store.volume.layout import Store

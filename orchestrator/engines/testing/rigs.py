@@ -11,7 +11,7 @@ from typing import Any, Protocol, Self
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus
 from orchestrator.engines.testing.fake import FakeCluster, FakeEngine
-from orchestrator.engines.toolkit.looks import observing_several
+from orchestrator.engines.toolkit.statuses import observing_several
 from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.files import write_atomic
 from shared_store.volume.layout import Store

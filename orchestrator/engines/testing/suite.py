@@ -20,7 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from orchestrator.domain.hosts import engine_of
 from orchestrator.engines.api import GangStatus, Handle, NodePhase, NodeStatus, NotYet, read_handle
 from orchestrator.engines.testing.rigs import Rig
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from orchestrator.engines.toolkit.waiting import wait_until
 
 LIMIT = 120.0

@@ -1,4 +1,4 @@
-"""The last response of a backend that is slow to read: its value, its age, and why there is no newer one."""
+"""View of a backend: the last response of one that is slow to read: its value, its age, and why there is no newer one."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from orchestrator.engines.api import EngineError, Gang, NotYet, Transient
 from orchestrator.engines.aws_batch import engine as aws_batch
 from orchestrator.engines.aws_batch.config import AwsConfig, is_mounted_from, save_config
 from orchestrator.engines.aws_batch.engine import AwsBatchEngine
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from shared_store.volume.epoch import Claim, raise_epoch, read_epoch
 from shared_store.volume.layout import Store
 from tests.conftest import Serving, call_muster, wait_for

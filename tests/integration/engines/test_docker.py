@@ -15,7 +15,7 @@ from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import EngineError, Gang
 from orchestrator.engines.docker import engine as docker_engine
 from orchestrator.engines.docker.engine import DockerEngine
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from shared_store import __version__
 from shared_store.volume.log_files import LogWriter
 from tests.conftest import REPOSITORY, wait_for

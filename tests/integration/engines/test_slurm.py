@@ -17,7 +17,7 @@ from orchestrator.engines.slurm import slurm_commands
 from orchestrator.engines.slurm.engine import SlurmEngine
 from orchestrator.engines.slurm.slurm_commands import SlurmJob, list_hosts
 from orchestrator.engines.slurm.states import waiting
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from tests.conftest import Serving, wait_for
 from tests.support.engines.sites import STUBBORN, WAIT
 from tests.support.engines.slurm_bench import SlurmBench, slurm_bench

@@ -38,7 +38,7 @@ from orchestrator.engines.installed import make_engine
 from orchestrator.engines.local.engine import LocalEngine
 from orchestrator.engines.registry import EngineSet
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from orchestrator.engines.toolkit.waiting import stop_within
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.model import validate

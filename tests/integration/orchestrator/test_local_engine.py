@@ -18,7 +18,7 @@ import pytest
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Cause, EngineError, Gang, Handle
 from orchestrator.engines.local.engine import LocalEngine
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from shared_store.process.processes import children, end_all, find_process, marked
 from shared_store.volume.epoch import raise_epoch
 from tests.conftest import wait_for

@@ -98,10 +98,10 @@ def test_what_learns_numbers_alone_takes_no_choices(full: Serving, algorithm: st
 @pytest.mark.parametrize(
     ("change", "output"),
     [
-        (f"action_space={CHOICES}", "ranges of 2 actions, and the clone would have 3 actions to choose from"),
-        ("waypoints=5", "8, and the clone would have 5"),
-        ("obstacles=[{distance: 3.0}]", "none, and the clone would have some"),
-        ("lidar={sectors: 4}", "none, and the clone would have one of 4 numbers"),
+        (f"action_space={CHOICES}", "ranges of 2 actions; with 3 actions to choose from, as in the clone"),
+        ("waypoints=5", "8; with 5, as in the clone"),
+        ("obstacles=[{distance: 3.0}]", "none; with some, as in the clone"),
+        ("lidar={sectors: 4}", "none; with one of 4 numbers, as in the clone"),
     ],
 )
 def test_a_clone_whose_network_would_have_another_size_is_refused(full: Serving, change: str, output: str) -> None:

@@ -11,7 +11,7 @@ from orchestrator.domain.gang import gang_needs
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Gang
 from orchestrator.engines.local.engine import LocalEngine
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from orchestrator.spec import file as specfile
 from orchestrator.spec.compile import compile_definition
 from shared_store.volume.checkpoints import list_checkpoints

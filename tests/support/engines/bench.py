@@ -11,7 +11,7 @@ from typing import Any
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus, NotYet
 from orchestrator.engines.testing import rigs
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from shared_store.volume.epoch import raise_epoch, read_epoch
 from shared_store.volume.layout import Store
 from shared_store.volume.log_view import LogView

@@ -8,7 +8,7 @@ from typing import Any
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Gang, Handle
 from orchestrator.engines.ray.engine import RayEngine
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from tests.support.engines.bench import Bench
 from tests.support.engines.ray_cluster import RayCluster
 from tests.support.engines.sites import WAIT

@@ -12,7 +12,7 @@ import pytest
 from orchestrator.domain.hosts import Placement
 from orchestrator.engines.api import Gang, Handle
 from orchestrator.engines.slurm.engine import SlurmEngine
-from orchestrator.engines.toolkit.looks import status_of
+from orchestrator.engines.toolkit.statuses import status_of
 from tests.support.engines.bench import Bench
 from tests.support.engines.sites import WAIT
 from tests.support.engines.slurm_cluster import SlurmCluster

@@ -19,7 +19,7 @@ from orchestrator.engines.api import (
     Traits,
     node_plans,
 )
-from orchestrator.engines.toolkit.looks import ended, one_by_one
+from orchestrator.engines.toolkit.statuses import ended, one_by_one
 from tests.support.simulation.cluster import SimulatedNode
 
 if TYPE_CHECKING:

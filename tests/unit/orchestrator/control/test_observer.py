@@ -13,7 +13,7 @@ from orchestrator.control.presence import Presence
 from orchestrator.control.run_store import Errands, StoreUnavailable
 from orchestrator.domain.attempt_events import Observed
 from orchestrator.engines.api import Cause, GangStatus, NodePhase, NodeStatus
-from orchestrator.engines.toolkit.looks import ended
+from orchestrator.engines.toolkit.statuses import ended
 from orchestrator.persistence.batch_models import Attempt, Node
 from shared_store.volume.node_outcomes import Outcome
 from tests.support.orchestrator.rows import job

@@ -13,7 +13,7 @@ from orchestrator.engines.ray.engine import _status as ray_status
 from orchestrator.engines.slurm.engine import _node as slurm_node
 from orchestrator.engines.slurm.engine import _queued as slurm_queued
 from orchestrator.engines.slurm.slurm_commands import SlurmJob
-from orchestrator.engines.toolkit.looks import ended
+from orchestrator.engines.toolkit.statuses import ended
 from shared_store.contract.faults import Fault
 from shared_store.volume.node_outcomes import OUT_OF_MEMORY, FirstError, Outcome
 
