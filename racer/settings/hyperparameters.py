@@ -190,9 +190,7 @@ def _whole(low: int, high: float) -> Callable[[Any], int]:
         except ValueError:
             number = 0.5
         if number != int(number):
-            raise ValueError(
-                f"a whole number from {low} to {high:g}" if high < math.inf else f"a whole number from {low} on"
-            )
+            raise ValueError(f"an integer from {low} to {high:g}" if high < math.inf else f"an integer from {low} on")
         return int(number)
 
     return check

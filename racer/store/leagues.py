@@ -354,7 +354,7 @@ def digest_of_track(store: Store, name: str) -> str | None:
         return None
     if name.startswith("random:"):
         raise LeagueError(
-            f"track {shown(name)}: after random: stands a whole number from 0 to {2**63 - 1}, such as random:7"
+            f"track {shown(name)}: after random: stands an integer from 0 to {2**63 - 1}, such as random:7"
         )
     try:
         track = tracks.find(store, name, tracks.PRESETS)

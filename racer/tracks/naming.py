@@ -32,7 +32,7 @@ def resolve(name: str, store: Store | None) -> Track:
         seed = name.removeprefix(RANDOM)
         if not (seed.isascii() and seed.isdecimal() and len(seed) < 20 and int(seed) <= LARGEST_SEED):
             raise BadTrack(
-                f"track {shown(name)}: after {RANDOM} stands a whole number from 0 to {LARGEST_SEED}, such as {RANDOM}7"
+                f"track {shown(name)}: after {RANDOM} stands an integer from 0 to {LARGEST_SEED}, such as {RANDOM}7"
             )
         return make_random(int(seed))
     try:

@@ -203,8 +203,8 @@ TESTS = {
         "episodes_are_played_until_the_last_one_of_any_rank_has_ended": {"evaluation/episodes.py": "_one_round"},
         "a_request_to_leave_that_one_rank_has_got_ends_all_with_a_checkpoint": {"learning/loop.py": "Loop._handle"},
         "a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read": {"learning/state.py": "TrainingState.restore"},
-        "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/initial_weights.py": "adopt"},
-        "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/initial_weights.py": "load_teacher"},
+        "a_clone_begins_with_the_same_weights_on_all_ranks": {"learning/loaded_weights.py": "adopt"},
+        "all_ranks_have_the_teacher_whether_it_was_copied_or_not": {"learning/loaded_weights.py": "load_teacher"},
         "worlds_that_do_not_fit_are_refused_by_all_ranks": {
             "learning/memory_estimate.py": "_taken measure within_memory"
         },

@@ -66,6 +66,9 @@ class Point(TaskReport):
     ended = None
     adapting = None
 
+    def bundle_documents(self, algorithm: str) -> Mapping[str, Mapping[str, Any]]:
+        return {}
+
     def __init__(
         self, config: PointConfig, world_count: int, *, seed: int = 0, first_world: int = 0, device: str = "cpu"
     ) -> None:

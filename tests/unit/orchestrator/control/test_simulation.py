@@ -86,4 +86,4 @@ def test_time_and_threads_of_the_control_plane_come_from_its_machine() -> None:
             calls = (node.func for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Call))
             if used := {ast.unparse(call) for call in calls} & SOURCES:
                 found[str(file.relative_to(REPOSITORY))] = used
-    assert found == {"orchestrator/persistence/migrations/versions/0002_batch.py": {"time.time"}}
+    assert not found
