@@ -16,7 +16,7 @@ PAGES = {
     "tasks/settings.md": settings_page.page,
 }
 TABLES = {"racer/rewards.md": reward_table.table}
-"""Pages of which one table is written: the one with the same first line."""
+"""Pages in which one table is replaced: the one with the same first line."""
 
 
 def main() -> None:

@@ -40,11 +40,11 @@ PORTING = """\
 # Term names of mjlab and Isaac Lab
 
 The names in `worker.tasks.terms` of the terms of mjlab 1.6 and Isaac Lab. A task may also use theirs: `terms.mjlab.joint_vel_l2` and
-`terms.isaaclab.joint_vel_l2` are our `terms.joint_velocity_squared`. Of several terms with one name theirs is the one without a remark. A name
-that is no term here is refused with the row below that says what to use instead. [terms.md](terms.md) gives meanings and
+`terms.isaaclab.joint_vel_l2` are our `terms.joint_velocity_squared`. Where several terms have one name, the alias is the one without a remark. A name
+without a term here is refused with the row below that says what to use instead. [terms.md](terms.md) gives meanings and
 parameters, which are ours under either name, and [ports.md](ports.md) compares a whole task of each with ours. `python -m docs.tools`
 writes this page from the functions' docstrings. Randomisation of physics, mjlab's `dr.*` and Isaac Lab's `randomize_*`, is not a
-term here but a `Randomize`: [their names](randomization.md#names-of-mjlab-and-isaac-lab). What else is no term here is at
+term here but a `Randomize`: [their names](randomization.md#names-of-mjlab-and-isaac-lab). What else has no term here is at
 [the end](#names-that-are-no-terms-here). Three differences hold everywhere:
 
 - Quaternions are xyzw here, and wxyz there.

@@ -53,6 +53,14 @@ def refusal(run: Run, chosen: Checkpoint, error: DamagedCheckpoint) -> ClientErr
     return ClientError(f"run {run.name}: {error}; choose another ({', '.join(others) or 'there is none'})", CONFLICT)
 
 
+def manifest_of(run: Run, chosen: Checkpoint) -> dict[str, Any]:
+    """The manifest of a checkpoint. Raises ClientError where it can't be read."""
+    try:
+        return chosen.manifest
+    except DamagedCheckpoint as error:
+        raise refusal(run, chosen, error) from None
+
+
 def check_task(run: Run) -> None:
     """Raise ClientError where the task of a run's policy is not installed here, as its submission and its resuming would."""
     with suppress(DamagedCheckpoint):  # which the job that reads it names
@@ -82,10 +90,7 @@ def check_evaluation(store: Store, run: Run, spec: Mapping[str, Any], key: str =
     chosen = choose(run, requested)
     if chosen is None:
         raise ClientError(f"run {run.name} has no checkpoint yet; train it first", 404)
-    try:
-        facts = chosen.manifest
-    except DamagedCheckpoint as error:
-        raise refusal(run, chosen, error) from None
+    facts = manifest_of(run, chosen)
     task, trained = facts.get("task"), facts.get("train")
     kind = task_config(task) if isinstance(task, str) else None
     before = trained.get("config") if isinstance(trained, dict) else None

@@ -22,7 +22,7 @@ from orchestrator.engines.registry import FRESH
 from orchestrator.persistence.batch_models import Job
 from orchestrator.persistence.ownership import FoundRun, first_description, forget_gone_run
 from orchestrator.services import submission
-from orchestrator.services.chosen_checkpoints import CONFLICT, choose, refusal
+from orchestrator.services.chosen_checkpoints import CONFLICT, choose, manifest_of, refusal
 from orchestrator.services.context import Context, Known, release, using, with_store
 from orchestrator.services.permissions import Actor
 from orchestrator.services.runs import spec_of
@@ -188,10 +188,7 @@ def _choose(source: Run, changes: Changes) -> Checkpoint:
     chosen = choose(source, changes.checkpoint)
     if chosen is None:
         raise ClientError(f"run {source.name} has no checkpoint yet, so there are no weights to begin with", 404)
-    try:
-        _ = chosen.manifest
-    except DamagedCheckpoint as error:
-        raise refusal(source, chosen, error) from None
+    manifest_of(source, chosen)
     return chosen
 
 

@@ -26,7 +26,6 @@ from shared_store.volume.files import (
     difference_of,
     json_bytes,
     manifest_entry,
-    read_json,
     sync_directory,
     sync_file,
     write_json,
@@ -106,13 +105,7 @@ def reason(error: Exception, bundle: Path) -> str:
 
 def read_document(folder: Path, name: str, called: str) -> dict[str, Any]:
     """A JSON document of a bundle or a model, which errors call ``called``. Raises DamagedBundle."""
-    try:
-        document = read_json(folder / name)
-    except (OSError, ValueError) as error:
-        raise DamagedBundle(f"{called}: {name} can't be read ({error})") from error
-    if document is None:
-        raise DamagedBundle(f"{called}: {name} is missing")
-    return document
+    return files.read_present(folder, name, lambda words: DamagedBundle(f"{called}: {words}"))
 
 
 def read_contract(bundle: Path) -> Contract:

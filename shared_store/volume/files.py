@@ -254,6 +254,17 @@ def manifest_entry(path: Path) -> dict[str, Any]:
         return {"size": os.fstat(file.fileno()).st_size, "sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
+def read_present(folder: Path, name: str, damaged: Callable[[str], Exception]) -> dict[str, Any]:
+    """A JSON document that must be in a directory. Raises what ``damaged`` makes of the error's words."""
+    try:
+        document = read_json(folder / name)
+    except (OSError, ValueError) as error:
+        raise damaged(f"{name} can't be read ({error})") from error
+    if document is None:
+        raise damaged(f"{name} is missing")
+    return document
+
+
 def read_manifest(
     folder: Path,
     names: re.Pattern[str],
@@ -265,12 +276,7 @@ def read_manifest(
 
     Raises what ``damaged`` makes of the error's words; for a format after the ``newest``, what ``newer`` does.
     """
-    try:
-        manifest = read_json(folder / MANIFEST)
-    except (OSError, ValueError) as error:
-        raise damaged(f"{MANIFEST} can't be read ({error})") from error
-    if manifest is None:
-        raise damaged(f"{MANIFEST} is missing")
+    manifest = read_present(folder, MANIFEST, damaged)
     number, files = manifest.get("format"), manifest.get("files")
     if not isinstance(number, int):
         raise damaged(f"{MANIFEST} has no format")

@@ -143,11 +143,8 @@ class Task(TaskSketch):
         with on_torch_stream(self.device):
             self.groups, self.terminal_groups = self._group()
             self._begin()
-            for (
-                _,
-                part,
-            ) in self._control.parts():  # Load every kernel; not every platform can load one during a capture.
-                part()
+            for _, part in self._control.parts():
+                part()  # loads every kernel: not every platform can load one during a capture
         self._watchers: dict[str, Callable[[], None] | None] = {}
         self._steps = [
             CapturedStep(part, self.device).launch if whole else part for whole, part in self._control.parts()
