@@ -230,8 +230,13 @@ def draw(robot: Robot, path: Path) -> None:
     """Draw a robot in its default pose. Raises UserError if the file can't be written."""
 
     class Alone(Task):
+        def robot(self, config: TaskConfig) -> Robot:
+            return robot
+
         def build(self, builder: newton.ModelBuilder) -> None:
-            robot.add_to(builder)
+            self.readings = {robot.name: robot.add_to(builder)}
+            self.views = {robot.name: RobotView(builder, robot.name)}
+            self.ground_terrain = None
 
     stage = Stage(Alone, TaskConfig(), 1)
     image = picture.StageCamera(stage, *PICTURE).take(np.array([stage.model.joint_q.numpy()]))
