@@ -56,8 +56,8 @@ def raw(url: str) -> Callable[[str, dict[str, Any]], dict[str, Any]]:
         answer = connection.getresponse()
         body = answer.read()
         assert answer.status == 200, body[:500]
-        told: dict[str, Any] = json.loads(body)
-        return told
+        reported: dict[str, Any] = json.loads(body)
+        return reported
 
     return call
 
@@ -260,7 +260,7 @@ def definition() -> dict[str, Any]:
 def rates(muster: Muster, moto: Moto) -> Iterator[list[str]]:
     """Rows: operation, client, clients at once, existing jobs; of both servers rate, p50, p99; ratio of the rates."""
     for existing in EXISTING:
-        there = {server: server.fill(existing) for server in (muster, moto)}
+        present = {server: server.fill(existing) for server in (muster, moto)}
         for operation in ("SubmitJob", "DescribeJobs"):
             for kind in CLIENTS:
                 for clients in (1, 8):
@@ -269,7 +269,7 @@ def rates(muster: Muster, moto: Moto) -> Iterator[list[str]]:
                         result = measure(server.url, kind, clients, operation, server.jobs, SECONDS)
                         server.jobs += result.ids
                         found.append(result)
-                    short = f" (moto {there[moto]:,})" if there[moto] < existing else ""
+                    short = f" (moto {present[moto]:,})" if present[moto] < existing else ""
                     cells = [f"{r.per_second:,.0f} | {r.p50:.1f} | {r.p99:.1f}" for r in found]
                     ratio = found[0].per_second / found[1].per_second
                     yield [operation, kind, str(clients), f"{existing:,}{short}", *cells, f"{ratio:.1f}"]

@@ -78,7 +78,7 @@ def main() -> None:
             }
             browser.close()
         servers = open_pages(server, trained)
-        TABLE.write_text(table(rows, late, servers, load.told([watch.check("during the measurement")])))
+        TABLE.write_text(table(rows, late, servers, load.reported([watch.check("during the measurement")])))
         print(TABLE.read_text())
     finally:
         server.close()
@@ -108,10 +108,10 @@ def fill(server: Serving) -> tuple[str, str]:
 
 def train(server: Serving, iterations: int) -> str:
     """The id of a training with two worlds."""
-    given = (f"--set={key}" for key in ("nodes=1", "train.worlds=2", f"train.iterations={iterations}"))
-    told = server.muster("submit", "job_specs/cartpole.yaml", "--json", *given)
-    assert told.returncode == 0, told.stderr
-    job: str = json.loads(told.stdout)["jobId"]
+    supplied = (f"--set={key}" for key in ("nodes=1", "train.worlds=2", f"train.iterations={iterations}"))
+    reported = server.muster("submit", "job_specs/cartpole.yaml", "--json", *supplied)
+    assert reported.returncode == 0, reported.stderr
+    job: str = json.loads(reported.stdout)["jobId"]
     return job
 
 
@@ -133,7 +133,7 @@ def submit(client: Client, definition: str, name: str) -> str:
     return str(client.batch("SubmitJob", jobName=name, jobQueue="default", jobDefinition=definition)["jobId"])
 
 
-def visits(browser: Browser, url: str, name: str, path: str, is_there: str) -> dict[str, Any]:
+def visits(browser: Browser, url: str, name: str, path: str, exists: str) -> dict[str, Any]:
     """Medians over visits: times [s], bytes over the wire of a first visit, and of the script's heap."""
     context = browser.new_context(base_url=url)
     page = context.new_page()
@@ -144,18 +144,18 @@ def visits(browser: Browser, url: str, name: str, path: str, is_there: str) -> d
             sum(request.sizes()[each] for each in ("responseBodySize", "responseHeadersSize"))
         ),
     )
-    found = [visit(page, path, is_there) for _ in range(VISITS + 1)]
+    found = [visit(page, path, exists) for _ in range(VISITS + 1)]
     context.close()
     with httpx.Client(base_url=url) as plain:
         size = len(plain.get(path).content)
     return {"name": name, "html": size, **{key: statistics.median(each[key] for each in found[1:]) for key in found[0]}}
 
 
-def visit(page: Page, path: str, is_there: str) -> dict[str, float]:
+def visit(page: Page, path: str, exists: str) -> dict[str, float]:
     page.goto(path, wait_until="load")
-    page.wait_for_function(is_there, polling="raf")
+    page.wait_for_function(exists, polling="raf")
     page.wait_for_function("() => performance.getEntriesByName('first-contentful-paint').length", polling="raf")
-    told: dict[str, float] = page.evaluate(
+    reported: dict[str, float] = page.evaluate(
         """() => {
           const [navigation] = performance.getEntriesByType("navigation");
           const [paint] = performance.getEntriesByName("first-contentful-paint");
@@ -166,7 +166,7 @@ def visit(page: Page, path: str, is_there: str) -> dict[str, float]:
     session.send("Performance.enable")
     metrics = {each["name"]: each["value"] for each in session.send("Performance.getMetrics")["metrics"]}
     session.detach()
-    return {**{key: value / 1000 for key, value in told.items()}, "heap": metrics["JSHeapUsedSize"]}
+    return {**{key: value / 1000 for key, value in reported.items()}, "heap": metrics["JSHeapUsedSize"]}
 
 
 def states(browser: Browser, server: Serving) -> list[float]:
@@ -180,8 +180,10 @@ def states(browser: Browser, server: Serving) -> list[float]:
             continue
         server.client.batch("TerminateJob", jobId=job, reason="measured")
         stopped = time.time()
-        there = "job => document.querySelector(`tr[data-key='${job}'] .badge`).textContent === 'FAILED' && Date.now()"
-        found.append(page.wait_for_function(there, arg=job, polling="raf").json_value() / 1000 - stopped)
+        existing = (
+            "job => document.querySelector(`tr[data-key='${job}'] .badge`).textContent === 'FAILED' && Date.now()"
+        )
+        found.append(page.wait_for_function(existing, arg=job, polling="raf").json_value() / 1000 - stopped)
     page.close()
     return [max(0.0, each) for each in found]
 
@@ -195,12 +197,12 @@ def points(browser: Browser, server: Serving) -> list[float]:
         metrics.write({"iteration": 10**9, "reward": 0})
         page.goto(f"/jobs/{job}")
         page.wait_for_selector("[data-charts] svg")
-        there = "told => [...document.querySelectorAll('[data-charts] li b')].some((each) => each.textContent === told) && Date.now()"
+        existing = "told => [...document.querySelectorAll('[data-charts] li b')].some((each) => each.textContent === told) && Date.now()"
         for number in range(1, EVENTS + 1):
             time.sleep(0.37)  # in step with nothing
             written = time.time()
             metrics.write({"iteration": 10**9 + number, "reward": 5000 + number})
-            shown = page.wait_for_function(there, arg=str(5000 + number), polling="raf").json_value()
+            shown = page.wait_for_function(existing, arg=str(5000 + number), polling="raf").json_value()
             found.append(shown / 1000 - written)
     page.close()
     server.client.batch("TerminateJob", jobId=job, reason="measured")
@@ -213,7 +215,7 @@ def lines(browser: Browser, server: Serving, job: str) -> list[float]:
     page = browser.new_page(base_url=server.url)
     page.goto(f"/jobs/{job}")
     page.wait_for_selector(".line")
-    told = page.evaluate(
+    reported = page.evaluate(
         """count => new Promise((done) => {
           const late = [];
           new MutationObserver((changes) => {
@@ -225,7 +227,7 @@ def lines(browser: Browser, server: Serving, job: str) -> list[float]:
         EVENTS,
     )
     page.close()
-    return [float(each) for each in told]
+    return [float(each) for each in reported]
 
 
 def open_pages(server: Serving, trained: str) -> list[dict[str, Any]]:

@@ -13,7 +13,7 @@ from typing import Any
 
 from nicegui import app, ui
 
-PORT, SOURCE, ROWS, *GIVEN = sys.argv[1:]
+PORT, SOURCE, ROWS, *SUPPLIED = sys.argv[1:]
 JOBS: list[dict[str, Any]] = json.loads(Path(SOURCE).read_text())
 FIELDS = ("name", "status", "reason", "queue", "nodes", "progress", "rate", "reward", "created", "ran", "owner")
 changed = {"count": 0}
@@ -21,8 +21,8 @@ changed = {"count": 0}
 
 async def policy(request: Any, call_next: Any) -> Any:
     answer = await call_next(request)
-    if GIVEN:
-        answer.headers["Content-Security-Policy"] = GIVEN[0]
+    if SUPPLIED:
+        answer.headers["Content-Security-Policy"] = SUPPLIED[0]
     return answer
 
 

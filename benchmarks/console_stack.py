@@ -72,7 +72,7 @@ def main() -> None:
                 "during the measurement"
             )  # before the close: the load of a closed browser would count as that of other processes
             browser.close()
-        TABLE.write_text(table(found, policies, load.told([seen])))
+        TABLE.write_text(table(found, policies, load.reported([seen])))
         print(TABLE.read_text())
     finally:
         shutil.rmtree(place, ignore_errors=True)
@@ -102,7 +102,7 @@ def stop(server: Serving, jobs: list[str]) -> None:
 
 def rows(server: Serving) -> list[dict[str, Any]]:
     """The texts of the console's table, for NiceGUI."""
-    told = server.client.get("/api/jobs", max=50)["jobs"]
+    reported = server.client.get("/api/jobs", max=50)["jobs"]
     kept = {
         "queue": "default",
         "nodes": 1,
@@ -114,7 +114,13 @@ def rows(server: Serving) -> list[dict[str, Any]]:
         "owner": "user",
     }
     return [
-        {"id": f"{i:036}", "name": f"waits-{i:04}", "status": "RUNNABLE", "reason": told[-1]["statusReason"], **kept}
+        {
+            "id": f"{i:036}",
+            "name": f"waits-{i:04}",
+            "status": "RUNNABLE",
+            "reason": reported[-1]["statusReason"],
+            **kept,
+        }
         for i in range(JOBS)
     ]
 
@@ -151,8 +157,8 @@ def measured(browser: Browser, name: str, url: str, pid: int, row: str, change: 
     for _ in range(VISITS + 1):
         page.goto(url, timeout=120_000)
         page.wait_for_function("([row]) => document.querySelectorAll(row).length >= 50", arg=[row], polling="raf")
-        told = "() => [performance.getEntriesByType('navigation')[0].responseStart, performance.now()].map((each) => each / 1000)"
-        times.append(page.evaluate(told))
+        reported = "() => [performance.getEntriesByType('navigation')[0].responseStart, performance.now()].map((each) => each / 1000)"
+        times.append(page.evaluate(reported))
         first = first or sum(sizes)
     html = len(httpx.get(url, trust_env=False).content)
     context.close()
@@ -184,14 +190,14 @@ def measured(browser: Browser, name: str, url: str, pid: int, row: str, change: 
 def under(browser: Browser, url: str) -> tuple[int, list[str]]:
     """Rows of the table that are shown under a policy, and the directives that were broken."""
     page = browser.new_page()
-    said = list[str]()
-    page.on("console", lambda message: said.append(message.text))
+    output = list[str]()
+    page.on("console", lambda message: output.append(message.text))
     page.goto(url)
     page.wait_for_timeout(5000)
     count = page.locator("tbody tr").count()
     page.close()
     words = ("script-src", "style-src", "trusted-types", "unsafe-eval", "font-src", "img-src", "connect-src")
-    return count, sorted({word for word in words for text in said if word in text and "Policy" in text})
+    return count, sorted({word for word in words for text in output if word in text and "Policy" in text})
 
 
 def table(found: list[dict[str, Any]], policies: list[tuple[str, int, list[str]]], loaded: str) -> str:

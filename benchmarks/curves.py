@@ -20,7 +20,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.stock import stock_runner
 from benchmarks.training import CUDA, build, wait
 from worker.evaluation.evaluation import evaluate
@@ -136,7 +136,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [
         "# Whole trainings",
         "",
-        f"`python -m benchmarks.curves`, each task with its own settings. {told(rows)} ![reward against steps]({NAME}.png)",
+        f"`python -m benchmarks.curves`, each task with its own settings. {reported(rows)} ![reward against steps]({NAME}.png)",
         "",
         "| task | by | worlds | steps | time | mean return | of the mean action | under MuJoCo's own solver limits | its length |",
         "|---|---|--:|--:|--:|--:|--:|--:|--:|",

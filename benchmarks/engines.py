@@ -57,23 +57,23 @@ def _try(site: Site, times: dict[str, list[float]]) -> dict[str, str]:
         attempts = site.serving.detail(job)["attempts"]
         return len(attempts) > attempt or bool(attempts[attempt - 1]["statusReason"])
 
-    begun = time.monotonic()
+    started = time.monotonic()
     job = site.submit(STAYS, nodes=2, attempts=4)
-    times["first"].append(seconds(begun, lambda: site.printed(job)))
+    times["first"].append(seconds(started, lambda: site.printed(job)))
     site.ready(job, 1, 2)
     kill: Callable[[str, int], None]
     for attempt, (name, kill) in enumerate((("rank", kill_rank), ("node", kill_supervisor)), 1):
-        begun = time.monotonic()
+        started = time.monotonic()
         kill(job, 1)
-        times[name].append(seconds(begun, noticed))
-        again = seconds(begun, lambda: site.printed(job, attempt + 1).count("ready") == 2)  # noqa: B023 at once
+        times[name].append(seconds(started, noticed))
+        again = seconds(started, lambda: site.printed(job, attempt + 1).count("ready") == 2)  # noqa: B023 at once
         if name == "node":
             times["again"].append(again)
     memory = _memory(site)
-    begun = time.monotonic()
+    started = time.monotonic()
     site.serving.client.batch("TerminateJob", jobId=job, reason="measured")
     times["stop"].append(
-        seconds(begun, lambda: not processes_of_job(job) and site.serving.detail(job)["status"] == "FAILED")
+        seconds(started, lambda: not processes_of_job(job) and site.serving.detail(job)["status"] == "FAILED")
     )
     return memory
 

@@ -171,14 +171,14 @@ def rounded(point: Mapping[str, Any]) -> dict[str, Any]:
 def planned(options: argparse.Namespace) -> list[Training]:
     """The trainings that the command asks for."""
     kinds: dict[str, Mapping[str, Any] | None] = {"default": {}, "then": PPOConfig.before, "stock": None}
-    for asked in options.by:
-        name, equals, settings = asked.partition("=")
+    for requested in options.by:
+        name, equals, settings = requested.partition("=")
         kinds |= {name: json.loads(settings)} if equals else {}
     plan = []
     for spec in options.specs or PLAN:
         seeds, times = PLAN[spec]
         iterations = round(section_of(spec)[0]["iterations"] * (options.times or times))
-        for by in (asked.partition("=")[0] for asked in options.by):
+        for by in (requested.partition("=")[0] for requested in options.by):
             plan += [Training(spec, by, seed, iterations, kinds[by]) for seed in range(options.seeds or seeds)]
     return plan
 

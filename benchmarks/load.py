@@ -92,7 +92,7 @@ def machine() -> str:
     return f"{os.cpu_count()} cores ({platform.machine()}), Python {platform.python_version()}, no GPU used"
 
 
-def told(rows: Sequence[Mapping[str, Any]]) -> str:
+def reported(rows: Sequence[Mapping[str, Any]]) -> str:
     """A sentence for the table of ``rows``, each with its result of :meth:`Watch.check`."""
     known = [row for row in rows if "others" in row]
     if not known:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 from unittest import mock
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.stock import stock_config, stock_runner
 from benchmarks.training import build, device_name, wait
 from shared_store.volume.metrics import read_metrics
@@ -103,7 +103,7 @@ def table(found: dict[tuple[str, str], list[float]], worlds: int, rows: list[dic
         f"# One configuration, four loops, on {device_name()}",
         "",
         f"Million steps a second by the clock, with logging and checkpoints, {worlds:,} worlds; medians of several runs in turn; "
-        f"`python -m benchmarks.loops`. {told(rows)}",
+        f"`python -m benchmarks.loops`. {reported(rows)}",
         "",
         f"| task | runs | {' | '.join(WAYS)} |",
         "|---|--:|" + "--:|" * len(WAYS),

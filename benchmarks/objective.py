@@ -19,7 +19,7 @@ from unittest import mock
 
 import torch
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.training import build, device_name, wait
 from worker.learning.ppo import fused, heads
 from worker.learning.ppo.rollout_buffer import RolloutBuffer
@@ -105,7 +105,7 @@ def main() -> None:
             head = [
                 f"# The loss of the fused PPO on {device_name()}",
                 "",
-                f"{options.worlds:,} worlds, medians in ms, one run; `python -m benchmarks.objective`. {told(rows)}",
+                f"{options.worlds:,} worlds, medians in ms, one run; `python -m benchmarks.objective`. {reported(rows)}",
                 "",
                 "| task | loss | learning | iteration |",
                 "|---|---|--:|--:|",

@@ -25,7 +25,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from benchmarks.load import Watch, add_option, machine, told
+from benchmarks.load import Watch, add_option, machine, reported
 from shared_store.contract.policy import Contract
 from shared_store.volume.bundles import seal
 
@@ -131,14 +131,14 @@ def drive(endpoint: str, robot: Any, rate: float, seconds: float) -> list[float]
     with open_session(endpoint, None) as session:
         node = Node(session, robot.messages, name="driver")
         node.subscribe("joint_commands", JOINT_STATE, commanded)
-        said = robot.measured(0)
-        publishers = [node.publisher(topic, kind) for topic, kind, _ in said]
+        output = robot.measured(0)
+        publishers = [node.publisher(topic, kind) for topic, kind, _ in output]
         deadline = time.monotonic() + 1.0
         ends = deadline + seconds
         while deadline < ends:
             sleep_until(deadline)
             began[0] = time.monotonic()
-            for publisher, (_, _, message) in zip(publishers, said, strict=True):
+            for publisher, (_, _, message) in zip(publishers, output, strict=True):
                 publisher.publish(message)
             deadline += 1.0 / rate
         time.sleep(0.2)
@@ -190,12 +190,12 @@ def reached(found: Measured) -> str:
     for rate in RATES:
         middle = statistics.median(p99 for _, p99, _ in found[f"{ANSWER}, {rate:g} Hz"])
         words[middle < GOAL].append(f"{rate:g} Hz ({middle:.2f} ms)")
-    told = [
+    reported = [
         f"{verb} at {' and '.join(rates)}"
         for verb, rates in (("reached", words[True]), ("missed", words[False]))
         if rates
     ]
-    return " and ".join(told)
+    return " and ".join(reported)
 
 
 def measure(folder: Path) -> Measured:
@@ -231,9 +231,9 @@ def measure(folder: Path) -> Measured:
             common = ("--rate", f"{rate:g}", "--timeout", "1")
             node = NodeProcess(bundle, folder / "log", *common)
             drive(node.endpoint, robot, 50.0, SECONDS)
-            late = re.search(r"late p50 ([\d.]+), p99 ([\d.]+), max ([\d.]+) ms", said := node.end())
+            late = re.search(r"late p50 ([\d.]+), p99 ([\d.]+), max ([\d.]+) ms", output := node.end())
             if late is None:
-                raise SystemExit(f"the node did not act: {said}")
+                raise SystemExit(f"the node did not act: {output}")
             p50, p99, most = map(float, late.groups())
             found.setdefault(f"step later than its deadline, {rate:g} Hz", []).append((p50, p99, most))
     return found
@@ -250,7 +250,7 @@ def main() -> None:
     intro = (
         f"`python -m benchmarks.policy_node` on {machine()}: medians of {REPEATS} runs of {SECONDS:g} s each, in ms. Policy and "
         f"messages of Go1Flat, layers of {', '.join(map(str, LAYERS))}. Node and driver are two processes of this machine; the node is "
-        f"the router. {told([watch.check('while it was measured'), watch.start])}"
+        f"the router. {reported([watch.check('while it was measured'), watch.start])}"
     )
     head = ["| what | p50 | p99 | p99 of the runs | max |", "|---|---|---|---|---|"]
     end = (

@@ -30,7 +30,7 @@ from typing import Any
 import torch
 import yaml
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.peers.inside.clock import versions
 from benchmarks.training import CUDA, build, device_name, rate, wait
 from racer.settings.task import RacerConfig
@@ -267,7 +267,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         "| task | on | cars | first complete lap | drives | in the end | complete laps then | training | simulation | × real time, one car |",
         "|---|---|--:|---|---|---|--:|--:|--:|--:|",
     ]
-    wanted = " or ".join(sorted({f"{100 * row['wanted']:g} %" for row in rows}))
+    requested = " or ".join(sorted({f"{100 * row['wanted']:g} %" for row in rows}))
     for row in rows:
         last = row["judged"][-1]
         lines.append(
@@ -277,12 +277,12 @@ def table(rows: Sequence[Mapping[str, Any]]) -> str:
         )
     lines += [
         "",
-        f"First complete lap: of any car in training, whose actions are drawn. Drives: {wanted} of the judged episodes are complete laps, by the "
+        f"First complete lap: of any car in training, whose actions are drawn. Drives: {requested} of the judged episodes are complete laps, by the "
         "mean action on held-out worlds. DeepRacer's own simulator drives one car a process in real time, 15 control steps a second.",
     ]
     for row in rows:
         name = stem(row)
-        lines += ["", f"## {row['task']}, {where(row)}", "", told([dict(row)])]
+        lines += ["", f"## {row['task']}, {where(row)}", "", reported([dict(row)])]
         lines += ["", f"![progress and complete laps against time]({name}.png) ![a lap]({name}.gif)", ""]
         lines += [f"In the end, over {row['judged_worlds']} episodes:", ""]
         lines += ["| track | complete laps | best [s] | mean [s] |", "|---|--:|--:|--:|"]

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 import yaml
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.racer import HERE, JOBS, REAL_TIME, merged, simulation_rate
 from benchmarks.training import CUDA, build, device_name
 from worker.settings.errors import UserError
@@ -46,7 +46,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"# Simulation of cars with cameras, on {device}",
         "",
-        f"`python -m benchmarks.racer_simulation`: no policy, one grey image a car and step. {told(rows)}",
+        f"`python -m benchmarks.racer_simulation`: no policy, one grey image a car and step. {reported(rows)}",
         "",
         "| image [px] | cars | cars · steps/s | × one car in real time |",
         "|---|--:|--:|--:|",

@@ -22,7 +22,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.load import Watch, add_option, machine, told
+from benchmarks.load import Watch, add_option, machine, reported
 from benchmarks.spine import MUSTER, REPOSITORY, Bench, seconds
 from shared_store.process.processes import find_process
 from shared_store.volume.checkpoints import list_checkpoints
@@ -229,7 +229,7 @@ def main() -> None:
     command, name = (
         ("python -m benchmarks.resume --gpus", "resume_gpu.md") if options.gpus else ("make bench-resume", "resume.md")
     )
-    intro = f"`{command}` on {machine()}. Before it: {told([watch.start])}"
+    intro = f"`{command}` on {machine()}. Before it: {reported([watch.start])}"
     text = "\n".join(["# Saving and resuming", "", intro, "", *table, "SIGKILL of rank 1:", "", *gang, ""])
     (REPOSITORY / "benchmarks" / name).write_text(text)
     print(text)

@@ -20,7 +20,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.training import CUDA, device_name
 from racer.rewards.parameters import row_of
 from racer.rewards.reward import RewardFunction
@@ -137,7 +137,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"# Reward functions on {device_name()}",
         "",
-        f"`python -m benchmarks.rewards`; medians of {ROUNDS} rounds; Python workers on {len(os.sched_getaffinity(0))} processors. {told(rows)}",
+        f"`python -m benchmarks.rewards`; medians of {ROUNDS} rounds; Python workers on {len(os.sched_getaffinity(0))} processors. {reported(rows)}",
         "",
         "| function | cars | compiled [calls/s] | Python workers [calls/s] | ratio |",
         "|---|--:|--:|--:|--:|",

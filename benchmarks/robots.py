@@ -130,33 +130,33 @@ def measure(name: str, path: Path) -> Row:
         )
     state = "corrected" if reading.corrected else "as it is"
     twins = Twins(reading.reference.model, reading.builder)
-    there, here = twins.free_of_contacts()
-    row = Row(name, state, _short("".join(map(str, reading.corrected[:1])), path), there.nv)
-    if not there.nv:
+    existing, here = twins.free_of_contacts()
+    row = Row(name, state, _short("".join(map(str, reading.corrected[:1])), path), existing.nv)
+    if not existing.nv:
         row.detail = "nothing of it moves"
         return row
     here.opt.gravity = twins.built.opt.gravity
-    controls = np.random.default_rng(1).uniform(-0.3, 0.3, there.nu)
-    first, second = mujoco.MjData(there), mujoco.MjData(here)
-    if np.abs(second_of(there, first, controls)[-1] - first.qpos).max() < 1e-9:
-        speeds = np.random.default_rng(2).uniform(-0.2, 0.2, there.njnt)
+    controls = np.random.default_rng(1).uniform(-0.3, 0.3, existing.nu)
+    first, second = mujoco.MjData(existing), mujoco.MjData(here)
+    if np.abs(second_of(existing, first, controls)[-1] - first.qpos).max() < 1e-9:
+        speeds = np.random.default_rng(2).uniform(-0.2, 0.2, existing.njnt)
         for joint, twin in twins.joints.items():
-            if freedoms(there, joint) == 1:
-                first.qvel[there.jnt_dofadr[joint]] = second.qvel[here.jnt_dofadr[twin]] = speeds[joint]
+            if freedoms(existing, joint) == 1:
+                first.qvel[existing.jnt_dofadr[joint]] = second.qvel[here.jnt_dofadr[twin]] = speeds[joint]
     columns = twins.columns()
-    path_there, path_here = second_of(there, first, controls), second_of(here, second, controls)
-    row.seconds = len(path_there) / steps_of(there)
+    path_to, path_here = second_of(existing, first, controls), second_of(here, second, controls)
+    row.seconds = len(path_to) / steps_of(existing)
     if row.seconds < 1.0:
         row.detail = f"{row.detail}; it grows without bound, compared for {row.seconds:.2g} s".strip("; ")
-    row.engine = difference(path_there[:, columns[0]], path_here[:, columns[1]])
+    row.engine = difference(path_to[:, columns[0]], path_here[:, columns[1]])
     if not row.engine <= EXACT:
         row.float32 = max(
-            difference(path_there, second_of(disturbed(there, seed), first, controls)) for seed in range(4)
+            difference(path_to, second_of(disturbed(existing, seed), first, controls)) for seed in range(4)
         )
     try:
-        last = in_muster(robot, twins, there, second.qvel, controls)
+        last = in_muster(robot, twins, existing, second.qvel, controls)
         if row.seconds == 1.0:
-            row.own = difference(path_there[-1, columns[0]], last[columns[1]])
+            row.own = difference(path_to[-1, columns[0]], last[columns[1]])
     except (ValueError, NotImplementedError) as error:
         row.detail = f"{row.detail}; not stepped by Muster: {error}".strip("; ")
     return row
@@ -201,22 +201,28 @@ def disturbed(model: Any, seed: int) -> Any:
     return other
 
 
-def in_muster(robot: Robot, twins: Twins, there: Any, speeds: Any, controls: Any) -> Any:
+def in_muster(robot: Robot, twins: Twins, existing: Any, speeds: Any, controls: Any) -> Any:
     """From the velocities ``speeds`` of the built model on, the coordinates after one second in Muster's own worlds, in the built model's order, shape ``(nq,)``, float32."""
     builder = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(builder)
-    if not there.nu:
+    if not existing.nu:
         robot = dataclasses.replace(robot, actuators=(EffortActuator("*"),))
     robot.add_to(builder)
     for joint, dof in enumerate(twins.dofs):
         if freedoms(twins.built, joint) == 1:
             builder.joint_qd[dof] = float(speeds[twins.built.jnt_dofadr[joint]])
-    options = {"disable_contacts": True, "integrator": int(there.opt.integrator), "njmax": 400}
+    options = {"disable_contacts": True, "integrator": int(existing.opt.integrator), "njmax": 400}
     worlds = Worlds(
-        builder, 1, "cpu", timestep=there.opt.timestep, substeps=steps_of(there), fastest=1e9, solver_options=options
+        builder,
+        1,
+        "cpu",
+        timestep=existing.opt.timestep,
+        substeps=steps_of(existing),
+        fastest=1e9,
+        solver_options=options,
     )
     worlds.restore_defaults()
-    if there.nu:
+    if existing.nu:
         worlds.arrays.controls.assign(controls[None].astype(np.float32))
     worlds.simulate()
     return worlds.solver.mjw_data.qpos.numpy()[0]

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.curves import worth
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.training import build, device_name
 
 PLAN: dict[str, tuple[dict[str, int], float, tuple[float, ...]]] = {
@@ -41,8 +41,14 @@ def train(task: str, algorithm: str, seed: int, judged: bool) -> dict[str, Any]:
                 curve.append((round(seconds, 3), record["env_steps"], round(record["reward"], 2)))
         found = worth(loop) if judged else {}
         loop.close()
-    told = {"task": task, "algorithm": algorithm, "worlds": worlds[algorithm], "seed": seed, "device": device_name()}
-    return told | found | {"curve": curve}
+    reported = {
+        "task": task,
+        "algorithm": algorithm,
+        "worlds": worlds[algorithm],
+        "seed": seed,
+        "device": device_name(),
+    }
+    return reported | found | {"curve": curve}
 
 
 def thinned(row: dict[str, Any]) -> dict[str, Any]:
@@ -64,7 +70,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"# sac and ppo on {rows[0]['device']}",
         "",
         "Seconds and million steps until ten iterations in a row had the stated mean return, medians over seeds, the worst seed in "
-        f"brackets; `python -m benchmarks.sac`. {told(rows)} ![return against time](sac.png)",
+        f"brackets; `python -m benchmarks.sac`. {reported(rows)} ![return against time](sac.png)",
         "",
         "| task | algorithm | worlds | return | seeds that reached it | seconds | million steps |",
         "|---|---|--:|--:|--:|--:|--:|",

@@ -17,7 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.training import CUDA, build, device_name
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.metrics import read_metrics
@@ -59,7 +59,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"# What a save costs, on {device_name()}",
         "",
-        f"Medians, by the clock; `python -m benchmarks.saving`. {told(rows)}",
+        f"Medians, by the clock; `python -m benchmarks.saving`. {reported(rows)}",
         "",
         "| task | worlds | a checkpoint | saves | an iteration [ms] | before a save | after it | both together | host, meanwhile [ms] |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|",

@@ -24,7 +24,7 @@ from uuid import UUID
 
 from sqlalchemy import insert
 
-from benchmarks.load import Watch, add_option, machine, told
+from benchmarks.load import Watch, add_option, machine, reported
 from orchestrator.console import jobs as jobs_page
 from orchestrator.console import live
 from orchestrator.console.live import Recent
@@ -230,7 +230,7 @@ def main() -> None:
             server.close()
         size = sum(each.stat().st_size for each in home.glob("muster.db*")) / 2**20
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(f"{machine()}. {told([watch.check('during the measurement')])}")
+    print(f"{machine()}. {reported([watch.check('during the measurement')])}")
     print(f"Database {size:.0f} MiB; peak memory of the process {peak:.0f} MiB.\n")
     print("| request | wall p50 [ms] | p99 | CPU p50 [ms] | p99 |\n|---|---|---|---|---|")
     print("\n".join(found))

@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from tests.support.hosts import start_ranks, two_hosts
 
 ITERATIONS = 60
@@ -126,7 +126,7 @@ def table(options: argparse.Namespace, rows: list[dict[str, Any]]) -> str:
     lines = [
         f"# {options.task} on several {torch.cuda.get_device_name()}",
         "",
-        f"{options.worlds:,} worlds a GPU, NCCL; steps/s of all together, in millions; efficiency against one GPU. {told(rows)}",
+        f"{options.worlds:,} worlds a GPU, NCCL; steps/s of all together, in millions; efficiency against one GPU. {reported(rows)}",
         "",
         "| GPUs | training | efficiency | iteration | collect | learn | slowest rank |",
         "|--:|--:|--:|--:|--:|--:|--:|",

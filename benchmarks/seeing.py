@@ -28,7 +28,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.training import CUDA, build, device_name
 from shared_store.volume.layout import Run
 from shared_store.volume.metrics import read_metrics
@@ -69,12 +69,12 @@ def watched(loop: Loop) -> list[int]:
         wait(iterations)
         marks.append(done())
 
-    def attended(is_ready: Callable[[], bool], said: Path, *command: str) -> None:
-        with said.open("w") as output:
-            reader = subprocess.Popen([sys.executable, "-m", *command], stdout=output, stderr=subprocess.STDOUT)
+    def attended(is_ready: Callable[[], bool], output: Path, *command: str) -> None:
+        with output.open("w") as stream:
+            reader = subprocess.Popen([sys.executable, "-m", *command], stdout=stream, stderr=subprocess.STDOUT)
         while not is_ready():  # its imports and construction take seconds of processor time
             if reader.poll() is not None:
-                raise RuntimeError(f"{command[0]} ended at once:\n{said.read_text()}")
+                raise RuntimeError(f"{command[0]} ended at once:\n{output.read_text()}")
             time.sleep(0.05)
         wait(WARM)  # the rollout was captured anew
         mark(STRETCH)
@@ -92,14 +92,14 @@ def watched(loop: Loop) -> list[int]:
     def look(folder: Path) -> None:
         wait(WARM)
         worlds = ("--worlds", str(TAPPED))
-        made, said = folder / "live.mcap", folder / "said.txt"
-        output = ("--episodes", "1000000", "--output", str(made))
-        recorded = ("worker.telemetry.live_recording", str(run.path), *worlds, *output)
-        attended((folder / "live.mcap.partial").exists, said, *recorded)
+        made, output = folder / "live.mcap", folder / "output.txt"
+        options = ("--episodes", "1000000", "--output", str(made))
+        recorded = ("worker.telemetry.live_recording", str(run.path), *worlds, *options)
+        attended((folder / "live.mcap.partial").exists, output, *recorded)
         mark(STRETCH)
         if find_spec("rerun"):
             viewed = ("worker.telemetry.live_view", "--training", str(run.path), "--job", "bench", *worlds)
-            attended(lambda: "http://" in said.read_text(), said, *viewed)
+            attended(lambda: "http://" in output.read_text(), output, *viewed)
 
     with tempfile.TemporaryDirectory() as folder:
         watcher = threading.Thread(target=look_on, args=(Path(folder),))
@@ -209,7 +209,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"# What looking at a policy costs, on {device_name()}",
         "",
         f"`python -m benchmarks.seeing`; medians of {ROUNDS} pairs of trainings with the same seed; of one, `muster record` writes {TAPPED} "
-        f"worlds for {STRETCH} iterations, no reader follows for as many, then `muster view` shows them. {told(rows)}",
+        f"worlds for {STRETCH} iterations, no reader follows for as many, then `muster view` shows them. {reported(rows)}",
         "",
         "| task | worlds | an iteration without a reader [ms] | while worlds are recorded | after that | in the live view |",
         "|---|--:|--:|--:|--:|--:|",

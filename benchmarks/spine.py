@@ -17,7 +17,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from benchmarks.load import Watch, add_option, machine, told
+from benchmarks.load import Watch, add_option, machine, reported
 from orchestrator.client import Client
 
 REPOSITORY = Path(__file__).parent.parent
@@ -136,7 +136,14 @@ def main() -> None:
         rows = measure(Path(directory))
     table = ["| what | measured |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
     text = "\n".join(
-        ["# The spine", "", f"`make bench` on {machine()}; one run. Before it: {told([watch.start])}", "", *table, ""]
+        [
+            "# The spine",
+            "",
+            f"`make bench` on {machine()}; one run. Before it: {reported([watch.start])}",
+            "",
+            *table,
+            "",
+        ]
     )
     (REPOSITORY / "benchmarks" / "spine.md").write_text(text)
     print(text)

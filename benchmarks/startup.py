@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.load import Watch, add_option, machine, told
+from benchmarks.load import Watch, add_option, machine, reported
 
 REPOSITORY = Path(__file__).parent.parent
 MUSTER = str(Path(sys.executable).parent / "muster")
@@ -83,7 +83,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as directory:
         rows = measure(Path(directory))
     table = ["| what | goal | median |", "|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)]
-    intro = f"`make bench-startup` on {machine()}; {REPEATS} times each, `make run` 3 times. Before it: {told([watch.start])}"
+    intro = f"`make bench-startup` on {machine()}; {REPEATS} times each, `make run` 3 times. Before it: {reported([watch.start])}"
     text = "\n".join(["# Start-up", "", intro, "", *table, ""])
     (REPOSITORY / "benchmarks" / "startup.md").write_text(text)
     print(text)

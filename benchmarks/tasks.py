@@ -30,7 +30,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.training import CUDA, device_name, wait
 from worker.simulation.capture import CapturedStep
 from worker.simulation.episodes import STEP
@@ -190,7 +190,7 @@ def measure(name: str, worlds: int) -> dict[str, Any]:
     plain = made(find_task(name), worlds)
 
     def with_sensors(added: dict[str, Any]) -> Task:
-        change = lambda given: dataclasses.replace(given, sensors={**given.sensors, **added})  # noqa: E731
+        change = lambda supplied: dataclasses.replace(supplied, sensors={**supplied.sensors, **added})  # noqa: E731
         return made(varied(name, change), worlds)
 
     added, looking = sensors(name), eyes(name)
@@ -253,7 +253,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [
         f"# What tasks are made of, on {device_name()}",
         "",
-        f"Medians of {ROUNDS} rounds in which all graphs take turns; `python -m benchmarks.tasks`. {told(rows)}",
+        f"Medians of {ROUNDS} rounds in which all graphs take turns; `python -m benchmarks.tasks`. {reported(rows)}",
         "",
         "## A control step",
         "",

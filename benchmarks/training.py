@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 
-from benchmarks.load import Watch, add_option, told
+from benchmarks.load import Watch, add_option, reported
 from benchmarks.stock import stock_runner, stock_seconds
 from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Store
@@ -208,7 +208,7 @@ def table(rows: list[dict[str, Any]]) -> str:
         f"# Training on {where}",
         "",
         f"Policy steps of all worlds together per second, in {name}; `python -m benchmarks.training`. Stock rsl-rl trains on the same "
-        f"simulation, captured, in the same run. {told(rows)}",
+        f"simulation, captured, in the same run. {reported(rows)}",
         "",
         "| task | worlds | environment | + policy | training | stock rsl-rl | ratio | collect | learn | until captured |",
         "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|",

@@ -25,7 +25,7 @@ from unittest import mock
 import numpy as np
 import rerun as rr
 
-from benchmarks.load import Watch, add_option, machine, told
+from benchmarks.load import Watch, add_option, machine, reported
 from benchmarks.training import build
 from shared_store.volume.layout import Run
 from tests.support.browser import empty_page
@@ -198,7 +198,7 @@ def table(row: dict[str, Any]) -> str:
         "",
         f"`python -m benchmarks.view_latency` on {machine()}: {row['task']} trains with {row['worlds']} worlds, `muster view` shows {SHOWN} of "
         f"them, Chromium without a display has its page open and draws with a software rasteriser on the same cores, {row['rate']:.1f} frames "
-        f"a second. In {row['seconds']:.0f} s {row['sent']} frames were sent, and of {len(times)} all times were seen. {told([row])}",
+        f"a second. In {row['seconds']:.0f} s {row['sent']} frames were sent, and of {len(times)} all times were seen. {reported([row])}",
         "",
         "| what [ms] | p50 | p99 | max |",
         "|---|--:|--:|--:|",

@@ -118,8 +118,8 @@ class WalkingLoop(Loop):
     def _judge(self) -> None:
         seconds, started = self.trained, time.perf_counter()
         progress = self.state.progress
-        told = progress.iteration - 1, progress.reward, progress.episode_length
-        begin_evaluation(self._worlds, *told, adaptive_steps(self.task))
+        reported = progress.iteration - 1, progress.reward, progress.episode_length
+        begin_evaluation(self._worlds, *reported, adaptive_steps(self.task))
         judged = judge(self._worlds, self.algorithm.policy())
         row = {"seconds": seconds, "env_steps": progress.env_steps, "iteration": progress.iteration} | asdict(judged)
         self.curve.append(row)
@@ -145,7 +145,7 @@ def judged_with(config: Any) -> Any:
 def walk(options: argparse.Namespace, seed: int, store: Path) -> dict[str, Any]:
     """Train once, and report when the policy walked. Raises ValueError if the task can't be judged."""
     built = time.perf_counter()
-    asked = {
+    requested = {
         "task": options.task,
         "worlds": options.worlds,
         "iterations": options.iterations,
@@ -153,7 +153,7 @@ def walk(options: argparse.Namespace, seed: int, store: Path) -> dict[str, Any]:
         "save_every": options.save_every,
         "seed": seed,
     }
-    loop = build_loop(asked, store, WalkingLoop, algorithm=options.algorithm, **options.train)
+    loop = build_loop(requested, store, WalkingLoop, algorithm=options.algorithm, **options.train)
     assert isinstance(loop, WalkingLoop)
     own = type(loop.task)
     worlds = own(judged_with(loop.config), options.judged, seed=held_out_seed(seed), device=loop.gang.device)

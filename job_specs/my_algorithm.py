@@ -119,14 +119,14 @@ class Mine:
         for reward, going_on in zip(reversed(self.rewards), reversed(self.going_on), strict=True):
             future = reward + self.config.gamma * going_on * future
             returns.insert(0, future)
-        wanted, seen, drawn = torch.cat(returns), torch.cat(self.seen), torch.cat(self.drawn)  # shape (steps · W, …)
+        requested, seen, drawn = torch.cat(returns), torch.cat(self.seen), torch.cat(self.drawn)  # shape (steps · W, …)
         values = self.value(seen)
-        advantages = (wanted - values).detach()  # how much better an action was than expected
+        advantages = (requested - values).detach()  # how much better an action was than expected
         # each rank's mean counts as much as it has worlds: summed over the ranks it is the mean over all worlds
         size = self.gang.sum(self.part * advantages.square().mean()).sqrt() + 1e-6
         policy = Normal(self.actor(seen), self.actor.log_std.exp(), validate_args=False)
         policy_loss = -(policy.log_prob(drawn).sum(1) * advantages / size).mean()
-        value_loss = (values - wanted).square().mean()
+        value_loss = (values - requested).square().mean()
         self.optimizer.zero_grad()
         (self.part * (policy_loss + 0.5 * value_loss)).backward()
         for parameter in self.parameters:
@@ -134,8 +134,12 @@ class Mine:
         nn.utils.clip_grad_norm_(self.parameters, 1.0)
         self.optimizer.step()
         self.actor.square.lerp_(self.gang.sum(self.part * seen.square().mean(0)), 0.05)
-        told = self.gang.sum(self.part * torch.stack((policy_loss, value_loss)).detach())
-        return {"policy_loss": told[0], "value_loss": told[1], "action_std": self.actor.log_std.detach().exp().mean()}
+        reported = self.gang.sum(self.part * torch.stack((policy_loss, value_loss)).detach())
+        return {
+            "policy_loss": reported[0],
+            "value_loss": reported[1],
+            "action_std": self.actor.log_std.detach().exp().mean(),
+        }
 
     def policy(self):
         """What is evaluated at the end."""

@@ -22,7 +22,7 @@ class ServiceManager:
         self.interval = int(period) / 2e6 if is_watched else None
         """Seconds between two signs of life: half of what the manager allows; None where it expects none."""
 
-    def tell(self, state: str) -> None:
+    def notify(self, state: str) -> None:
         """Send ``READY=1``, ``WATCHDOG=1`` or ``STOPPING=1``. Nothing happens where the manager is gone."""
         if self._address:
             with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
@@ -41,6 +41,6 @@ class ServiceManager:
         def watch() -> None:
             while not wait(interval):
                 if is_alive():
-                    self.tell("WATCHDOG=1")
+                    self.notify("WATCHDOG=1")
 
         machine.thread("watchdog", watch)

@@ -45,12 +45,12 @@ os.environ.setdefault("MUSTER_PICTURE", "0")
 def call_muster(*arguments: str, home: Path, cwd: Path = REPOSITORY, **env: str) -> subprocess.CompletedProcess[str]:
     """Run the command in this process, a second quicker than in a new one. Its standard input is empty."""
     assert threading.current_thread() is threading.main_thread(), "it replaces what all threads share"
-    said, errors = io.StringIO(), io.StringIO()
+    output, errors = io.StringIO(), io.StringIO()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     with (
         pytest.MonkeyPatch.context() as patch,
         mock_patch.dict(os.environ, {"MUSTER_HOME": str(home), "COLUMNS": "200", **env}),
-        contextlib.redirect_stdout(said),
+        contextlib.redirect_stdout(output),
         contextlib.redirect_stderr(errors),
     ):
         patch.setattr(sys, "argv", ["muster", *arguments])
@@ -64,7 +64,7 @@ def call_muster(*arguments: str, home: Path, cwd: Path = REPOSITORY, **env: str)
         finally:
             for number, handler in handlers.items():
                 signal.signal(number, handler)
-    return subprocess.CompletedProcess(arguments, int(code or 0), said.getvalue(), errors.getvalue())
+    return subprocess.CompletedProcess(arguments, int(code or 0), output.getvalue(), errors.getvalue())
 
 
 def run_muster(
@@ -148,13 +148,13 @@ class Serving:
 
     def wait(self, job: str, *statuses: str, timeout: float = 60) -> dict[str, Any]:
         """The job's detail, once it is in one of ``statuses`` (by default, over)."""
-        wanted = statuses or ("SUCCEEDED", "FAILED")
+        requested = statuses or ("SUCCEEDED", "FAILED")
 
-        def there() -> dict[str, Any] | None:
+        def existing() -> dict[str, Any] | None:
             detail = self.detail(job)
-            return detail if detail["status"] in wanted else None
+            return detail if detail["status"] in requested else None
 
-        found: dict[str, Any] = wait_for(there, timeout, f"job {job} {wanted}")
+        found: dict[str, Any] = wait_for(existing, timeout, f"job {job} {requested}")
         return found
 
     def log(self, job: str, **query: Any) -> list[str]:

@@ -187,7 +187,7 @@ def beside_a_rank() -> None:
             os.write(output, json.dumps(words).encode() + b"\n")
 
     def say(text: str) -> None:
-        report(said=text)
+        report(message=text)
 
     run, epoch, train, kind = Run(Path(order["run"])), order["epoch"], order["train"], order["service"]
     service = SERVICES[kind](tracked_of(run, train, order["facts"]), order["settings"])

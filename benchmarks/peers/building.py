@@ -44,7 +44,7 @@ def limited(task: str, limits: Mapping[str, float]) -> tuple[type[Task], dict[st
     return type(task_type.__name__, (task_type,), {"solver_options": options}), settings
 
 
-def build_loop(asked: Mapping[str, Any], store: Path, loop_type: type[Loop] = Loop, **train: Any) -> Loop:
+def build_loop(requested: Mapping[str, Any], store: Path, loop_type: type[Loop] = Loop, **train: Any) -> Loop:
     """The training loop of ``muster run``, on its own store.
 
     Args:
@@ -58,17 +58,17 @@ def build_loop(asked: Mapping[str, Any], store: Path, loop_type: type[Loop] = Lo
         ValueError: The task does not exist.
         UserError: A setting that the task or the algorithm refuses.
     """
-    task_type, settings = limited(asked["task"], asked["limits"])
+    task_type, settings = limited(requested["task"], requested["limits"])
     placement = RankPlacement.from_env(os.environ)
-    run = Store(store).open().run(f"peers-{asked['task']}-{asked['worlds']}-{asked['seed']}".lower())
+    run = Store(store).open().run(f"peers-{requested['task']}-{requested['worlds']}-{requested['seed']}".lower())
     run.create({"run": run.name})
     raise_epoch(run, 1)
-    network = {name: asked[name] for name in ("steps", "hidden_sizes") if name in asked}
+    network = {name: requested[name] for name in ("steps", "hidden_sizes") if name in requested}
     if train.get("algorithm", "ppo") != "ppo":  # other algorithms have their own networks and steps
         network = {}
-    section = {name: asked[name] for name in ("task", "worlds", "iterations", "seed")}
+    section = {name: requested[name] for name in ("task", "worlds", "iterations", "seed")}
     section |= ({"ppo": network} if network else {}) | train | {"config": settings | train.get("config", {})}
     # keep every checkpoint, to judge them afterwards
-    spec = {"train": section, "checkpoint": {"every": asked["save_every"], "keep": 10**6}}
+    spec = {"train": section, "checkpoint": {"every": requested["save_every"], "keep": 10**6}}
     job = Job(spec, Store(store), run, 1, 1, "peers", section=section)
     return loop_type(Training.of(job, task_type), connect(placement), StopRequest())

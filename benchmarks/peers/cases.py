@@ -49,11 +49,11 @@ class Case:
     theirs: Limits
     ours: Limits
 
-    def limits(self, whose: str) -> Limits:
+    def limits(self, owner: str) -> Limits:
         """The solver's limits. Raises ValueError if ``whose`` is not one of :data:`LIMITS`."""
-        if whose not in LIMITS:
-            raise ValueError(f"limits {whose!r}: there are {' and '.join(LIMITS)}")
-        return self.theirs if whose == "theirs" else self.ours
+        if owner not in LIMITS:
+            raise ValueError(f"limits {owner!r}: there are {' and '.join(LIMITS)}")
+        return self.theirs if owner == "theirs" else self.ours
 
     def named_in(self, peer: str) -> str:
         """The task's name in ``peer``. Raises ValueError if the peer lacks it."""
@@ -64,9 +64,9 @@ class Case:
             raise ValueError(f"case {self.name}: {peer} has no such task; its cases are {able}")
         return self.peers[peer]
 
-    def shared(self, peer: str, whose: str) -> dict[str, Any]:
+    def shared(self, peer: str, owner: str) -> dict[str, Any]:
         """Its settings for a training, as plain values: ``task``, ``steps``, ``hidden_sizes``, ``limits``."""
-        task, limits = self.named_in(peer), asdict(self.limits(whose))
+        task, limits = self.named_in(peer), asdict(self.limits(owner))
         return {"task": task, "steps": self.steps, "hidden_sizes": list(self.hidden_sizes), "limits": limits}
 
 

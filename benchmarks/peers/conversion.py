@@ -143,10 +143,10 @@ def check_probe(policy: PlainPolicy, probe: Mapping[str, Any]) -> None:
     Raises:
         ValueError: Its actions differ.
     """
-    seen, given = torch.tensor(probe["observations"]), torch.tensor(probe["actions"])
+    seen, supplied = torch.tensor(probe["observations"]), torch.tensor(probe["actions"])
     device = policy.device
-    apart = float((policy.act({POLICY: seen.to(device)}).cpu() - given).abs().max())
-    if not apart <= CLOSE * max(1.0, float(given.abs().max())):
+    apart = float((policy.act({POLICY: seen.to(device)}).cpu() - supplied).abs().max())
+    if not apart <= CLOSE * max(1.0, float(supplied.abs().max())):
         raise ValueError(
             f"the converted policy acts otherwise than the one that was trained: actions are {apart:g} apart"
         )
@@ -178,12 +178,14 @@ def check_contract(contract: Mapping[str, Any], interface: Interface, task: str)
     scales = scales if isinstance(scales, Sequence) else [scales] * len(joints)
     positions = dict(zip(contract["joints"], contract["positions"], strict=True))
     for action, scale in zip(interface.actions, scales, strict=True):
-        for what, there, here in (
+        for what, existing, here in (
             ("scale", scale, action.scale),
             ("offset", positions[action.name], action.offset),
         ):
-            if not math.isclose(there, here, abs_tol=TOLERANCE):
-                raise ValueError(f"joint {action.name}: its {what} is {there:g} in mjlab and {here:g} in task {task}")
+            if not math.isclose(existing, here, abs_tol=TOLERANCE):
+                raise ValueError(
+                    f"joint {action.name}: its {what} is {existing:g} in mjlab and {here:g} in task {task}"
+                )
     _check_order(widths, [seen.name for seen in interface.observations], joints, task)
 
 

@@ -60,10 +60,10 @@ def make(name: str, folder: Path, python: str = sys.executable, torch_index: str
     """
     if name not in ENVIRONMENTS:
         raise ValueError(f"there is no environment {name!r}; {nearest(name, ENVIRONMENTS)}")
-    wanted = ENVIRONMENTS[name]
+    requested = ENVIRONMENTS[name]
     found = version_of(python)
-    if found not in wanted.python:
-        able = ", ".join(f"{major}.{minor}" for major, minor in wanted.python)
+    if found not in requested.python:
+        able = ", ".join(f"{major}.{minor}" for major, minor in requested.python)
         raise ValueError(
             f"{name} needs Python {able}, {python} is {found[0]}.{found[1]}; name another one with --python"
         )
@@ -79,22 +79,22 @@ def make(name: str, folder: Path, python: str = sys.executable, torch_index: str
         "--disable-pip-version-check",
     ]
     index = ["--index-url", torch_index] if torch_index else []
-    subprocess.run([*pip, *index, *wanted.torch], check=True)
-    subprocess.run([*pip, *wanted.torch, "--requirement", str(HERE / wanted.pins)], check=True)
-    for package in wanted.alone:
+    subprocess.run([*pip, *index, *requested.torch], check=True)
+    subprocess.run([*pip, *requested.torch, "--requirement", str(HERE / requested.pins)], check=True)
+    for package in requested.alone:
         subprocess.run([*pip, "--no-deps", package], check=True)
-    if wanted.finish:
-        wanted.finish(folder)
+    if requested.finish:
+        requested.finish(folder)
 
 
 def version_of(python: str) -> tuple[int, int]:
     """Major and minor version of an interpreter. Raises ValueError if it can't be started."""
-    asked = "import sys; print(*sys.version_info[:2])"
+    requested = "import sys; print(*sys.version_info[:2])"
     try:
-        said = subprocess.run([python, "-c", asked], check=True, capture_output=True, text=True).stdout
+        output = subprocess.run([python, "-c", requested], check=True, capture_output=True, text=True).stdout
     except (OSError, subprocess.CalledProcessError) as error:
         raise ValueError(f"{python} is no Python that can be started ({error}); name one with --python") from error
-    major, minor = map(int, said.split())
+    major, minor = map(int, output.split())
     return major, minor
 
 

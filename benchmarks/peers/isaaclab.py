@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measure("isaaclab", parser, _command, arguments)
 
 
-def _command(options: argparse.Namespace, case: Case, asked: str) -> tuple[list[str], dict[str, str]]:
+def _command(options: argparse.Namespace, case: Case, requested: str) -> tuple[list[str], dict[str, str]]:
     if options.frontend not in FRONTENDS:
         raise ValueError(f"--frontend {options.frontend}: there are {' and '.join(FRONTENDS)}")
     words, variables = other_process(options.environment / "bin" / "python", "train_isaaclab.py")
@@ -36,8 +36,8 @@ def _command(options: argparse.Namespace, case: Case, asked: str) -> tuple[list[
         raise ValueError(
             f"there are no robots in {assets}; python -m benchmarks.peers.environment isaaclab puts them there"
         )
-    told = json.dumps({**json.loads(asked), "frontend": options.frontend})
-    return [*words, told], {**variables, "ISAACSIM_ASSET_ROOT": str(assets), "OMNI_KIT_ACCEPT_EULA": "yes"}
+    reported = json.dumps({**json.loads(requested), "frontend": options.frontend})
+    return [*words, reported], {**variables, "ISAACSIM_ASSET_ROOT": str(assets), "OMNI_KIT_ACCEPT_EULA": "yes"}
 
 
 if __name__ == "__main__":

@@ -23,10 +23,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measure("mjlab", parser, _command, arguments)
 
 
-def _command(options: argparse.Namespace, case: Case, asked: str) -> tuple[list[str], dict[str, str]]:
+def _command(options: argparse.Namespace, case: Case, requested: str) -> tuple[list[str], dict[str, str]]:
     words, variables = other_process(options.environment / "bin" / "python", "train_mjlab.py")
     # it draws videos with OpenGL on request, which this never makes
-    return [*words, asked], {**variables, "WANDB_MODE": "disabled", "MUJOCO_GL": "disable"}
+    return [*words, requested], {**variables, "WANDB_MODE": "disabled", "MUJOCO_GL": "disable"}
 
 
 if __name__ == "__main__":

@@ -23,11 +23,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measure("muster", parser, _command, arguments)
 
 
-def _command(options: argparse.Namespace, case: Case, asked: str) -> tuple[list[str], dict[str, str]]:
+def _command(options: argparse.Namespace, case: Case, requested: str) -> tuple[list[str], dict[str, str]]:
     if options.algorithm not in ALGORITHMS:
         raise ValueError(f"--algorithm {options.algorithm}: there are {' and '.join(ALGORITHMS)}")
     words, variables = own_process("train_muster")
-    return [*words, json.dumps({**json.loads(asked), "algorithm": options.algorithm})], variables
+    return [*words, json.dumps({**json.loads(requested), "algorithm": options.algorithm})], variables
 
 
 if __name__ == "__main__":

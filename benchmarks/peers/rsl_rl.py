@@ -18,9 +18,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     measure("rsl_rl", options_of("rsl_rl", __doc__, cases_of("rsl_rl")), _command, arguments)
 
 
-def _command(options: argparse.Namespace, case: Case, asked: str) -> tuple[list[str], dict[str, str]]:
+def _command(options: argparse.Namespace, case: Case, requested: str) -> tuple[list[str], dict[str, str]]:
     words, variables = own_process("train_rsl_rl")
-    return [*words, asked], variables
+    return [*words, requested], variables
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ REPOSITORY = HERE.parent.parent
 RECORDS = HERE / "records"
 POINTS = 400
 """Most points of the curve in a record."""
-SAID = 25
+OUTPUT = 25
 """Number of last lines to show of a failed training."""
 
 Command = Callable[[argparse.Namespace, Case, str], tuple[list[str], dict[str, str]]]
@@ -104,8 +104,8 @@ def train(
 ) -> dict[str, Any]:
     """The record of one training in a separate process. Raises SystemExit with its last lines if it fails."""
     logs.mkdir(parents=True, exist_ok=True)
-    out, said = logs / "found.json", logs / "output.txt"
-    asked = case.shared(peer, options.limits) | {
+    out, output = logs / "found.json", logs / "output.txt"
+    requested = case.shared(peer, options.limits) | {
         "worlds": options.worlds,
         "iterations": options.iterations,
         "save_every": options.save_every,
@@ -114,19 +114,19 @@ def train(
         "out": str(out),
         "began": time.time(),
     }
-    words, variables = command(options, case, json.dumps(asked))
-    with said.open("w") as output:
+    words, variables = command(options, case, json.dumps(requested))
+    with output.open("w") as stream:
         ended = subprocess.run(
-            words, stdout=output, stderr=subprocess.STDOUT, env={**os.environ, **variables}, cwd=REPOSITORY
+            words, stdout=stream, stderr=subprocess.STDOUT, env={**os.environ, **variables}, cwd=REPOSITORY
         )
     if not out.exists():
-        last = "\n".join(said.read_text(errors="replace").splitlines()[-SAID:])
+        last = "\n".join(output.read_text(errors="replace").splitlines()[-OUTPUT:])
         raise SystemExit(f"{peer}: its training ended with exit code {ended.returncode} and no result:\n{last}")
-    return record_of(peer, case, options, asked, json.loads(out.read_text()))
+    return record_of(peer, case, options, requested, json.loads(out.read_text()))
 
 
 def record_of(
-    peer: str, case: Case, options: argparse.Namespace, asked: dict[str, Any], found: dict[str, Any]
+    peer: str, case: Case, options: argparse.Namespace, requested: dict[str, Any], found: dict[str, Any]
 ) -> dict[str, Any]:
     """The record of a training.
 
@@ -139,13 +139,13 @@ def record_of(
     if not options.keep:
         found["checkpoints"] = []
     facts = {"peer": peer, "case": case.name, "limits": options.limits, "warm": options.warm}
-    told = {name: asked[name] for name in ("task", "worlds", "iterations", "steps", "seed", "save_every")}
+    reported = {name: requested[name] for name in ("task", "worlds", "iterations", "steps", "seed", "save_every")}
     figures = {
         "rate": rate(curve, options.warm),
         "first_s": curve[0]["seconds"],
         "trained_s": curve[-1]["seconds"],
     }
-    return facts | told | figures | found | {"curve": thinned(curve)}
+    return facts | reported | figures | found | {"curve": thinned(curve)}
 
 
 def rate(curve: Sequence[dict[str, Any]], warm: int) -> float:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.load import told
+from benchmarks.load import reported
 from benchmarks.peers.cases import find_case
 from benchmarks.peers.judge import read_record
 from benchmarks.peers.run import RECORDS
@@ -64,7 +64,7 @@ def table(records: Sequence[Record], judged: Sequence[Record] = ()) -> str:
         "Steps a second by the clock, with logging and checkpoints, after the first iterations, each training in a process of its own; of "
         "several *runs* the median, the least and the greatest in brackets. The ratio is Muster's (algorithm `ppo`) to that row. Ready: from "
         "the start of the process to the first iteration (imports, worlds, compiled kernels). How it was measured: "
-        f"[README](README.md). {told(records)}",
+        f"[README](README.md). {reported(records)}",
     ]
     for device in _distinct(record["device"] for record in records):
         lines += ["", f"## On {device}", ""]

@@ -57,7 +57,7 @@ def page() -> str:
     parts = [HEAD]
     for family, names in FAMILIES.items():
         found = {name: sketch(name) for name in names}
-        parts.append(f"## {family}\n\n{_glance(found)}")
+        parts.append(f"## {family}\n\n{_preview(found)}")
         for section in ("observations", "observations of critic"):
             keys = ("name", "term", "numbers", "scale", "noise", "clip", "delay", "history")
             parts.append(_section(section, "columns of each", found, keys, lambda row: row["columns"]))
@@ -65,20 +65,20 @@ def page() -> str:
         parts.append(
             _section("rewards", "weights", found, ("name", "term", "numbers", "per"), lambda row: row["weight"])
         )
-        parts.append(_section("terminations", "", found, ("name", "term", "numbers", "counts as"), _there))
+        parts.append(_section("terminations", "", found, ("name", "term", "numbers", "counts as"), _admitted))
         parts.append(_section("commands", "how long each holds", found, ("name", "term"), lambda row: row["every"]))
         parts.append(_commands(found))
-        parts.append(_section("events", "pushes among them", found, ("name", "term", "numbers", "when"), _there))
-        parts.append(_section("randomize", "once for each world", found, ("name", "of"), _there))
-        parts.append(_section("curricula", "", found, ("name", "term", "numbers"), _there))
+        parts.append(_section("events", "pushes among them", found, ("name", "term", "numbers", "when"), _admitted))
+        parts.append(_section("randomize", "once for each world", found, ("name", "of"), _admitted))
+        parts.append(_section("curricula", "", found, ("name", "term", "numbers"), _admitted))
     return "\n".join(part for part in parts if part)
 
 
-def _there(row: Row) -> str:
+def _admitted(row: Row) -> str:
     return "yes"
 
 
-def _glance(found: Mapping[str, Sketch]) -> str:
+def _preview(found: Mapping[str, Sketch]) -> str:
     """The settings of each task that are one number or word."""
     rows = {name: _values(name, sketched) for name, sketched in found.items()}
     labels = next(iter(rows.values()))

@@ -15,12 +15,12 @@ class Turns:
     def __init__(self, what: str, at_once: int = 2, waiting: int = 6, patience: float = 20.0) -> None:
         """``what``: the work that goes on now, for the message of a refusal."""
         self._what, self._patience = what, patience
-        self._there, self._working = threading.Semaphore(at_once + waiting), threading.Semaphore(at_once)
+        self._admitted, self._working = threading.Semaphore(at_once + waiting), threading.Semaphore(at_once)
 
     @contextmanager
     def turn(self) -> Iterator[None]:
         """Raises ClientError (429) where too many wait already, or it takes too long."""
-        if not self._there.acquire(blocking=False):
+        if not self._admitted.acquire(blocking=False):
             raise self._refusal()
         try:
             if not self._working.acquire(timeout=self._patience):
@@ -30,7 +30,7 @@ class Turns:
             finally:
                 self._working.release()
         finally:
-            self._there.release()
+            self._admitted.release()
 
     def _refusal(self) -> ClientError:
         return ClientError(f"{self._what}; try again in a moment", 429)

@@ -216,13 +216,13 @@ def serve(
         echo(f"on all interfaces: from other machines http://{socket.gethostname()}:{server.url.rpartition(':')[2]}")
     echo(server.access.admitted())
     echo(f"home {muster_home()}, store {server.store.path}")
-    manager.tell("READY=1")
+    manager.notify("READY=1")
     manager.keep_alive(lambda: server.controller.monitoring.loop_problem() is None, ended.wait)
     try:
         while not ended.wait(1.0):  # Python sees a signal that another thread took when this one wakes
             pass
     finally:
-        manager.tell("STOPPING=1")
+        manager.notify("STOPPING=1")
         server.close()
     echo("stopped; running jobs continue and the next `muster serve` finds them")
 

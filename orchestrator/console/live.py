@@ -18,7 +18,7 @@ from fastapi.responses import Response, StreamingResponse
 from fastapi.sse import format_sse_event
 
 from orchestrator.api.http.access import Access
-from orchestrator.api.http.answer_streams import Following, looked_patiently
+from orchestrator.api.http.answer_streams import Following, polled_patiently
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.console.pages import session, shared, templates
 from orchestrator.control.store_calls import StoreCalls
@@ -113,7 +113,7 @@ async def _events(
     yield format_sse_event(retry=1000, comment="Muster")
     while goes_on():
         try:
-            async for result in looked_patiently(lambda: (poll(),), calls, _PATIENCE):
+            async for result in polled_patiently(lambda: (poll(),), calls, _PATIENCE):
                 if result is not None:
                     (found,) = result
                 elif goes_on():

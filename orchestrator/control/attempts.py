@@ -140,7 +140,7 @@ class Attempts:
         key, state = opened.key, opened.state
         if state.phase is AttemptPhase.LAUNCHING:
             pause = self.engine.launch_pause(_name(attempt), attempt.nodes[0].host)
-        elif self._stops.has_begun(key):
+        elif self._stops.has_started(key):
             pause = self._stops.pause(key)
         elif state.done_since is not None:
             pause = (state.done_since + FINISHING - self.clock.now()) / 1000

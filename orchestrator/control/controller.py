@@ -185,7 +185,7 @@ class Controller:
             self._is_cut_off = why is not None
             log.warning("%s", f"{why}: no gang ends for it" if why else "nodes are heard again")
         self._isolation.part("scheduling", self.admission.schedule)
-        self._isolation.part("clearing away", self._clear_away)
+        self._isolation.part("clearing away", self._clear)
 
     def _observe_gangs(self) -> None:
         active = self.work_queue.take_active(machine.monotonic())
@@ -251,6 +251,6 @@ class Controller:
         self.work_queue.note([job])
         settle(session, job, self.clock)
 
-    def _clear_away(self) -> None:
+    def _clear(self) -> None:
         self._isolation.backoff.tidy()
         self.upkeep.run()

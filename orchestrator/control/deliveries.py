@@ -171,8 +171,8 @@ class Deliveries:
                 session.delete(row)
             else:
                 row.tries, row.problem = row.tries + 1, problem
-                is_given_up = final or row.tries > len(self._pauses)
-                row.next_at = None if is_given_up else now() + int(1000 * self._pauses[row.tries - 1])
+                is_abandoned = final or row.tries > len(self._pauses)
+                row.next_at = None if is_abandoned else now() + int(1000 * self._pauses[row.tries - 1])
         if problem is None:
             monitoring.webhook_tried(webhook.name, "delivered")
             if self._backoff.worked(webhook.name):

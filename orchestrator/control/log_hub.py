@@ -93,9 +93,9 @@ class _Followed:
         self.wakers: list[Wakes] = []
         self.is_changed = True
         """Whether its row has to be read."""
-        self.is_looked_at = False
+        self.is_polled = False
         """Whether a look is under way."""
-        self.looked = float("-inf")
+        self.polled = float("-inf")
         """When the last look ended [s]."""
         self.found = machine.monotonic()
         """When a look has found something, or the last attempt has begun [s]."""
@@ -231,9 +231,9 @@ class LogHub:
             if now >= each.next_ask and (attempt := each.logs.attempt) is not None:
                 self._ask(each, attempt, now)
         for each in looking:
-            if each.is_looked_at:
+            if each.is_polled:
                 continue
-            if now >= (next_look := each.looked + max(each.pause, _SHARE * len(looking))):
+            if now >= (next_look := each.polled + max(each.pause, _SHARE * len(looking))):
                 self._look(each)
             else:
                 due = min(due, next_look)
@@ -262,7 +262,7 @@ class LogHub:
 
     def _ask(self, each: _Followed, attempt: int, now: float) -> None:
         """Ask the nodes of the open attempt to push their logs."""
-        each.asking = _ASK_SELDOM if each.logs.is_heard() else min(2 * each.asking, _ASK_SELDOM)
+        each.asking = _ASK_SELDOM if each.logs.is_connected() else min(2 * each.asking, _ASK_SELDOM)
         each.next_ask = now + each.asking
         self._bus.ask_for_logs(each.logs.job, attempt)
 
@@ -279,11 +279,11 @@ class LogHub:
                 pass
             finally:
                 # what has happened meanwhile may have asked for an earlier one
-                each.looked, each.pause, each.is_looked_at = machine.monotonic(), min(each.pause, pause), False
+                each.polled, each.pause, each.is_polled = machine.monotonic(), min(each.pause, pause), False
                 self._hurry_locked()
 
-        each.is_looked_at, each.pause = True, _LOOK_SELDOM
+        each.is_polled, each.pause = True, _LOOK_SELDOM
         try:
             self._calls.submit(look)
         except StoreSilent:
-            each.looked, each.pause, each.is_looked_at = machine.monotonic(), _AGAIN, False
+            each.polled, each.pause, each.is_polled = machine.monotonic(), _AGAIN, False

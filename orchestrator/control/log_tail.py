@@ -45,7 +45,7 @@ class Tail:
     """Pushes that came before what precedes them, by position."""
     stated: int | None = None
     """End of the file as its node has stated it last."""
-    heard: float = float("-inf")
+    received: float = float("-inf")
     """When that was [s]."""
     is_whole: bool = False
     """Whether its node has stated that nothing follows."""
@@ -68,7 +68,7 @@ class Tail:
 
     def delivers(self, now: float) -> bool:
         """Whether its node tells of each change, so that the file needs no look."""
-        return self.is_whole or now - self.heard < FRESH
+        return self.is_whole or now - self.received < FRESH
 
     def read(self, position: int, most: int) -> bytes | None:
         """Up to ``most`` bytes from ``position`` on; None where only the file has them."""
@@ -150,7 +150,7 @@ class JobLogs:
         """Number of changes that readers have to see."""
         self._changes = OrderedDict[Key, int]()
         """The version of each log's last change, the newest one last."""
-        self._has_looked = False
+        self._has_polled = False
         self._former: set[int] = set()
         """Attempts that were open, and whose logs were not looked at since."""
 
@@ -185,7 +185,7 @@ class JobLogs:
     def push(self, log: Key, position: int, data: bytes) -> bool:
         """A node has pushed a part of its log; whether something is new."""
         with self._lock:
-            is_new = self._has_looked and self._tails.setdefault(log, Tail(0)).push(position, data, self._most)
+            is_new = self._has_polled and self._tails.setdefault(log, Tail(0)).push(position, data, self._most)
             return self._noted(log, is_new)
 
     def _noted(self, log: Key, is_changed: bool) -> bool:
@@ -199,11 +199,11 @@ class JobLogs:
     def state(self, log: Key, end: int | None, is_whole: bool) -> bool:
         """A node has stated where its log ends (None: it does not push it); whether something is missing here."""
         with self._lock:
-            if not self._has_looked:
+            if not self._has_polled:
                 return False
             tail = self._tails.setdefault(log, Tail(0))
             tail.stated, tail.is_whole = end, is_whole
-            tail.heard = float("-inf") if end is None else machine.monotonic()
+            tail.received = float("-inf") if end is None else machine.monotonic()
             return tail.has_gap
 
     def note(self, attempt: int | None, nodes: int) -> bool:
@@ -221,16 +221,16 @@ class JobLogs:
     def delivers(self) -> bool:
         """Whether every node of the open attempt tells of each change of its log, and nothing is missing."""
         with self._lock:
-            if not self._has_looked or self._former:
+            if not self._has_polled or self._former:
                 return False
-            return self.attempt is None or (self._is_heard() and not any(tail.has_gap for tail in self._open()))
+            return self.attempt is None or (self._is_connected() and not any(tail.has_gap for tail in self._open()))
 
-    def is_heard(self) -> bool:
+    def is_connected(self) -> bool:
         """Whether every node of the open attempt tells of its log."""
         with self._lock:
-            return self._is_heard()
+            return self._is_connected()
 
-    def _is_heard(self) -> bool:
+    def _is_connected(self) -> bool:
         now = machine.monotonic()
         return sum(tail.delivers(now) for tail in self._open()) >= self.nodes
 
@@ -241,14 +241,14 @@ class JobLogs:
     def look(self) -> bool:
         """Read in the files what is missing in memory; whether something is new. Raises OSError."""
         with self._lock:
-            is_first, former, attempt = not self._has_looked, set(self._former), self.attempt
+            is_first, former, attempt = not self._has_polled, set(self._former), self.attempt
         changed = is_first
         for number in sorted(former | (set() if attempt is None else {attempt})):
             for log, segments in logs_of(self.run, self.job, number).items():
                 changed = self._look_at(log, segments, is_first, number in former) or changed
         with self._lock:
             self._former -= former
-            self._has_looked = True
+            self._has_polled = True
         return changed
 
     def _look_at(self, log: Key, segments: Sequence[LogSegment], is_first: bool, is_last: bool) -> bool:

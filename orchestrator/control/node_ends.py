@@ -26,13 +26,13 @@ def node_end(outcome: Outcome | None, node: NodeStatus, is_native: bool, moment:
     # a supervisor sees that its rank was killed; only the engine knows for what
     starved = outcome.signal == "SIGKILL" and node.cause is Cause.OUT_OF_MEMORY
     # another attempt fails by this exception, too, unless its node is to blame
-    error = outcome.error if not outcome.asked and node.cause in (None, Cause.EXIT) else None
+    error = outcome.error if not outcome.requested and node.cause in (None, Cause.EXIT) else None
     end = NodeEnd(
         outcome.exit_code,
         node.words if starved else outcome.reason,
         outcome.error.time if outcome.error else outcome.ended,
         outcome.error.message if outcome.error else None,
-        asked=outcome.asked,
+        requested=outcome.requested,
         cannot_start=outcome.cannot_start,
         fault=str(error.fault) if error and error.fault else None,
     )
@@ -53,6 +53,6 @@ def seen_end(node: NodeStatus, is_native: bool, moment: float) -> NodeEnd:
     if node.cause is Cause.EXIT:
         why = node.words.partition("; trying again")[0]
         words = f"exit {code}, outcome not written{f' ({why})' if why else ''}"
-        return NodeEnd(code, words, moment, asked=None)
+        return NodeEnd(code, words, moment, requested=None)
     words = node.words or "the supervisor died without an outcome"
     return NodeEnd(code, words, moment, lost=node.cause in _TAKEN, cannot_start=node.cause is Cause.CANNOT_START)

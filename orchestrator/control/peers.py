@@ -89,8 +89,8 @@ class Peers:
         if claim.controller not in self._seen and (found := self._read(claim.controller)):
             self._note(claim.controller, found)  # it started after the last look
         with self._lock:
-            peer, heard = self._seen.get(claim.controller, (None, None))
-        if peer is None or heard is None or machine.monotonic() - heard >= GONE:
+            peer, seen_at = self._seen.get(claim.controller, (None, None))
+        if peer is None or seen_at is None or machine.monotonic() - seen_at >= GONE:
             return None
         return f"job {short_id(claim.job)} (attempt {claim.attempt}) of {peer}"
 
@@ -127,7 +127,7 @@ class Peers:
     def _note(self, name: str, peer: Peer) -> None:
         """Any thread may call."""
         with self._lock:
-            before, heard = self._seen.get(name, (None, None))
+            before, seen_at = self._seen.get(name, (None, None))
             if before == peer:
                 return
             outdated = before is None and abs(machine.wall() - peer.time) > _OUTDATED
@@ -135,7 +135,7 @@ class Peers:
         if outdated:  # left by one that was killed; one that lives writes it again
             with contextlib.suppress(OSError):
                 (self._directory / f"{name}.json").unlink(missing_ok=True)
-        elif heard is None:
+        elif seen_at is None:
             log.warning(
                 "%s uses the store %s too: each runs jobs of its own, and neither starts a run that the other is writing",
                 peer,

@@ -36,7 +36,7 @@ _MISSING = "it has not come to this controller, which took over its job then"
 
 
 @dataclass
-class _Heard:
+class _Seen:
     """A node that this router has met."""
 
     gone: float | None = None
@@ -64,7 +64,7 @@ class Presence:
         self._expected: dict[tuple[str, int], int] = {}
         self._unmet: dict[tuple[str, int], float] = {}
         """Attempts of which no node has come or ended yet, and since when they are expected."""
-        self._nodes: dict[Node, _Heard] = {}
+        self._nodes: dict[Node, _Seen] = {}
         self._missing: dict[Node, tuple[float, str]] = {}
         """Nodes that an earlier controller met, and this router has not: since when they are expected, and the same for people."""
         self._sign_at = 0.0
@@ -107,14 +107,14 @@ class Presence:
         """A node is connected; of one that is not expected nothing is noted."""
         with self._lock:
             if self._expects(node):
-                self._set(node, _Heard())
+                self._set(node, _Seen())
                 self._sign_at = self._monotonic()
 
     def sent(self, node: Node) -> None:
         """A node has sent something: it is there, and the router hears it."""
         with self._lock:
-            heard = self._nodes.get(node)
-            if heard is not None and heard.gone is None:
+            seen = self._nodes.get(node)
+            if seen is not None and seen.gone is None:
                 self._note_deafness()
                 self._sign_at = self._monotonic()
 
@@ -123,18 +123,18 @@ class Presence:
         now, since = self._moment()
         with self._lock:
             if self._expects(node):
-                self._set(node, _Heard(now, since, now, now))
+                self._set(node, _Seen(now, since, now, now))
 
     def ended(self, node: Node) -> None:
         """A node has ended, so that its silence means nothing."""
         with self._lock:
             self._set(node, None)
 
-    def hear_itself(self, heard: bool) -> None:
+    def hear_itself(self, seen: bool) -> None:
         """Whether the router hears the controller's own session, by way of the loopback network."""
         with self._lock:
             self._note_deafness()
-            self._hears_itself = heard
+            self._hears_itself = seen
 
     def met(self, node: Node) -> bool:
         """Whether the node is or was connected, and has not ended."""
@@ -163,17 +163,17 @@ class Presence:
             now = self._monotonic()
             if (missing := self._missing.get(node)) is not None:
                 return Silence(now - missing[0], missing[1], False, _MISSING)
-            heard = self._nodes.get(node)
-            if heard is None or heard.gone is None:
+            seen = self._nodes.get(node)
+            if seen is None or seen.gone is None:
                 return None
             deaf = self._note_deafness()
-            if age is None or age > min(now - heard.gone, max(_FRESH, self.lost_after / 4)):
-                heard.answered = heard.confirmed = now
+            if age is None or age > min(now - seen.gone, max(_FRESH, self.lost_after / 4)):
+                seen.answered = seen.confirmed = now
             if not runs:
-                heard.confirmed = now
-            alone = now - max(heard.confirmed, self._deaf_at)
-            is_lost = alone > self.lost_after or (not runs and now - heard.answered > UNREACHABLE * self.lost_after)
-            return Silence(now - heard.gone, heard.since, is_lost, deaf or "")
+                seen.confirmed = now
+            alone = now - max(seen.confirmed, self._deaf_at)
+            is_lost = alone > self.lost_after or (not runs and now - seen.answered > UNREACHABLE * self.lost_after)
+            return Silence(now - seen.gone, seen.since, is_lost, deaf or "")
 
     def _moment(self) -> tuple[float, str]:
         """Now, in seconds of the monotonic clock and for people."""
@@ -182,17 +182,15 @@ class Presence:
     def _expects(self, node: Node) -> bool:
         return 0 <= node[2] < self._expected.get(node[:2], 0)
 
-    def _set(self, node: Node, heard: _Heard | None) -> None:
+    def _set(self, node: Node, seen: _Seen | None) -> None:
         """Note what is known of a node; None: nothing."""
         self._note_deafness()
         self._unmet.pop(node[:2], None)
         self._missing.pop(node, None)
         before = self._nodes.pop(node, None)
-        if heard is not None:
-            self._nodes[node] = heard
-        self._silent += (heard is not None and heard.gone is not None) - (
-            before is not None and before.gone is not None
-        )
+        if seen is not None:
+            self._nodes[node] = seen
+        self._silent += (seen is not None and seen.gone is not None) - (before is not None and before.gone is not None)
         self._burst = None
 
     def _note_deafness(self) -> str | None:

@@ -188,8 +188,8 @@ class Retention:
         try:
             self.stored.check()
             if left := trash.empty(self._store):
-                things = counted(len(left), "thing")
-                log.warning("%s in the store's trash can't be removed, such as %s; remove by hand", things, left[0])
+                leftovers = counted(len(left), "thing")
+                log.warning("%s in the store's trash can't be removed, such as %s; remove by hand", leftovers, left[0])
         except (OSError, Unavailable) as error:
             log.warning("the store's trash can't be emptied now (%s)", error)
 
@@ -305,7 +305,7 @@ class Retention:
         """
         unchanged, stay, gone = list[RetentionPlan](), dict[str, str](), set[str]()
         self.stored.check()
-        thrown, fixed = trash.throw_away(self._store, self._directories(plans, unchanged, stay))
+        thrown, fixed = trash.discard(self._store, self._directories(plans, unchanged, stay))
         self.stored.check()
         self._fixed |= fixed
         going = list[str]()
@@ -383,7 +383,7 @@ class Retention:
             size, files = (0, 0) if facts is None else trash.size_of(path)
             if not self.stored.is_unchanged(name, facts):
                 raise RunNeeded(f"run {name} has just changed, and nothing of it is deleted; try again in a moment")
-            thrown, fixed = trash.throw_away(self._store, [path])
+            thrown, fixed = trash.discard(self._store, [path])
             if path in fixed:
                 raise RunNeeded(f"run {name} is kept: {_unmoved(fixed[path])}")
             with self._writing, self._database.session() as session:

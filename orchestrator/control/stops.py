@@ -96,7 +96,7 @@ class Stops:
             return f"attempt {key[1]} waits for its turn to be stopped: the {stop.engine} engine is stopping {_THREADS} others"
         return f"attempt {key[1]} is being stopped"
 
-    def has_begun(self, key: Key) -> bool:
+    def has_started(self, key: Key) -> bool:
         """Whether a stop waits for its turn, is under way or has ended the gang."""
         return key in self._under_way or key in self._stopped
 

@@ -341,8 +341,8 @@ def _was_done(ending: Ending, native: bool, head: NodeEnd | None) -> bool:
     if head is None or head.exit_code != 0:
         return False
     if ending == Ending.STOPPED:
-        return head.asked is False
-    return not head.asked or ending == Ending.PREEMPTED or (native and ending != Ending.TIMEOUT)
+        return head.requested is False
+    return not head.requested or ending == Ending.PREEMPTED or (native and ending != Ending.TIMEOUT)
 
 
 def _retries(terms: Terms, verdict: Verdict, head: NodeEnd | None) -> bool:

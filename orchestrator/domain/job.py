@@ -110,7 +110,7 @@ class NodeEnd:
     """Message of the node's first error."""
     lost: bool = False
     """The end was not observed: the node vanished, presumably with its host."""
-    asked: bool | None = False
+    requested: bool | None = False
     """The node was asked to end: the cause lies elsewhere. None: that is not known."""
     cannot_start: bool = False
     """Its program or its container could not be started."""
@@ -228,10 +228,10 @@ def judge(policy: str, main: int, ends: Sequence[NodeEnd | None]) -> Verdict | N
     if not failures:
         return None
     # A child that dies breaks the main node's collectives within a second, so the first failure by time is the cause.
-    index, first = failures[first_cause([(bool(end.asked), end.ended) for _, end in failures])]
+    index, first = failures[first_cause([(bool(end.requested), end.ended) for _, end in failures])]
     ending = Ending.FATAL if policy == "fail" and index != main else Ending.FAILED
     reason = f"{'main node' if index == main else f'node {index}'}: {first.reason}"
-    return Verdict(ending, reason, first.exit_code, certain=not (first.asked and is_unseen), fault=first.fault)
+    return Verdict(ending, reason, first.exit_code, certain=not (first.requested and is_unseen), fault=first.fault)
 
 
 def retries(conditions: Sequence[Mapping[str, str]], exit_code: int | None, reason: str, status_reason: str) -> bool:

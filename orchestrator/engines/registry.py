@@ -82,8 +82,8 @@ class EngineSet:
         ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
         """
         deadline = machine.monotonic() + patience
-        asked = [name for name in (self.engines if names is None else names) if name in self._runners]
-        known = {name: self._runners[name].capacity(max(0.0, deadline - machine.monotonic())) for name in asked}
+        requested = [name for name in (self.engines if names is None else names) if name in self._runners]
+        known = {name: self._runners[name].capacity(max(0.0, deadline - machine.monotonic())) for name in requested}
         return {name: capacity for name, capacity in known.items() if capacity is not None}
 
     def unknown(self) -> Mapping[str, str]:

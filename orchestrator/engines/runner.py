@@ -70,7 +70,7 @@ T = TypeVar("T")
 class Health:
     """The state of an engine, for people."""
 
-    told_at: int | None
+    reported_at: int | None
     """When it last reported its capacity, Unix time [ms]; None before the first time."""
     problem: str | None
     """That it does not answer, or why it can't report its capacity; None while it does."""
@@ -108,7 +108,7 @@ class Runner:
         """When the next poll of all gangs is due (monotonic [s])."""
         self._reporting: Future[Capacity] | None = None
         self._capacity: Capacity | None = None
-        self._told_at: int | None = None
+        self._reported_at: int | None = None
         self._backoff = Backoff(log)
         self._was_silent = False
         self._thread = machine.pool(f"engine {engine.name}", 1)
@@ -161,7 +161,7 @@ class Runner:
         gangs = {subject[1]: pause for subject, pause in pauses.items() if isinstance(subject, tuple)}
         if _LOOKS in pauses:
             gangs |= dict.fromkeys(self._observed, pauses[_LOOKS])
-        return Health(self._told_at, problem, len(gangs), min(gangs.values(), default=None))
+        return Health(self._reported_at, problem, len(gangs), min(gangs.values(), default=None))
 
     # -- what the controller asks -------------------------------------------------------------------------------------
 
@@ -338,7 +338,7 @@ class Runner:
             self._failed("hosts", error)
             raise
         self._backoff.worked("hosts")
-        self._told_at = int(machine.wall() * 1000)
+        self._reported_at = int(machine.wall() * 1000)
         if capacity != self._capacity:
             self._capacity = capacity
             self._changed("")

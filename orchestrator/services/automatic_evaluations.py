@@ -35,9 +35,9 @@ from orchestrator.spec.evaluations import (
     Counted,
     automatic_evaluation,
     due,
+    evaluation_settings,
     first_count,
     place_of,
-    wanted_of,
 )
 from orchestrator.spec.sections import Evaluation
 from shared_store.contract.plugins import PluginError
@@ -203,7 +203,7 @@ class AutomaticEvaluations:
     def _read(self, job: Job) -> _Training | None:
         gang = job.gang
         try:
-            evaluation = wanted_of(gang.spec)
+            evaluation = evaluation_settings(gang.spec)
         except SpecError as error:  # it was checked when it was submitted
             raise ValueError(str(error)) from None
         if evaluation is None or job.first_epoch is None:
@@ -233,7 +233,9 @@ class AutomaticEvaluations:
             actor = self._actor_named(training.owner)
             if actor is None:
                 raise ClientError(f"{training.owner}, which submitted the training, has no access any more")
-            place = place_of(training.queue, wanted_of(inherited(actor, training.spec)) or training.evaluation)
+            place = place_of(
+                training.queue, evaluation_settings(inherited(actor, training.spec)) or training.evaluation
+            )
             spec = automatic_evaluation(run.name, training.spec, place, training.evaluation, chosen.iteration)
             tags, found = {AUTOMATIC_TAG: f"{run.name}@{chosen.iteration}"}, facts_of(run)
 

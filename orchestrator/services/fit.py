@@ -15,7 +15,7 @@ from orchestrator.scheduling.fit import Fit
 from orchestrator.services.context import queue_names
 from orchestrator.services.permissions import Actor
 from orchestrator.spec.compile import compile_definition
-from orchestrator.spec.evaluations import automatic_evaluation, place_of, wanted_of
+from orchestrator.spec.evaluations import automatic_evaluation, evaluation_settings, place_of
 
 
 def fit_of(session: Session, actor: Actor, controller: Controller, queue: JobQueue, gang: GangSpec) -> Fit:
@@ -47,7 +47,7 @@ def _problem_of_evaluations(
 ) -> str | None:
     """Why a training's automatic evaluations could never start in their queue; None where they could, or there are none."""
     try:
-        evaluation = wanted_of(gang.spec)
+        evaluation = evaluation_settings(gang.spec)
         if evaluation is None:
             return None
         place = place_of(queue.name, evaluation)

@@ -206,16 +206,16 @@ class Actor:
                     raise Refusal(
                         "AccessDeniedException", f"{self.name}: {operation} is refused, since {_made_by(each)}"
                     )
-                raise self._refusal(operation, _whose(each))
+                raise self._refusal(operation, _owner_of(each))
 
     def check_all_queues(self, operation: Operation | AddedOperation) -> None:
         """Raise Refusal unless the actor may see all queues in one answer."""
         if self.queues is not None:
             raise self._refusal(operation, "it concerns all queues")
 
-    def may_see(self, thing: Object) -> bool:
+    def may_see(self, target: Object) -> bool:
         """Whether the actor may read all of it; lists leave out the rest."""
-        return _allowed(self, Operation.LIST_JOBS, thing)
+        return _allowed(self, Operation.LIST_JOBS, target)
 
     def shown(self, answer: Any) -> Any:
         """An answer as the actor may see it: to a read-only key without the values of environment variables."""
@@ -251,45 +251,47 @@ def _hidden(environment: Any) -> Any:
     return environment
 
 
-def _allowed(actor: Actor, operation: Operation | AddedOperation, thing: Object) -> bool:
+def _allowed(actor: Actor, operation: Operation | AddedOperation, target: Object) -> bool:
     queues = actor.queues
     if queues is None:
         return True
-    match thing:
+    match target:
         case RunRecord() if operation in _OF_THE_OWNER:
-            return thing.queue in queues and thing.owner == actor.name
+            return target.queue in queues and target.owner == actor.name
         case Job() | RunRecord() | JobsOf():
-            return thing.queue in queues
+            return target.queue in queues
         case Owned() | LogGroup():
-            return thing.owner == actor.name or operation.reads
+            return target.owner == actor.name or operation.reads
         case JobDefinition():
-            shared = thing.tags.get(QUEUES_TAG, "").split()
+            shared = target.tags.get(QUEUES_TAG, "").split()
             tagged = "*" in shared or not queues.isdisjoint(shared)
-            return thing.owner == actor.name or (tagged and (operation.reads or operation is Operation.SUBMIT_JOB))
+            return target.owner == actor.name or (tagged and (operation.reads or operation is Operation.SUBMIT_JOB))
         case _:
             return operation.reads
 
 
-def _made_by(thing: Object) -> str:
-    owner = getattr(thing, "owner", None) or "an unknown key"
-    return f"run {getattr(thing, 'name', '')} was made by {owner}; its owner may, and a key with all queues"
+def _made_by(target: Object) -> str:
+    owner = getattr(target, "owner", None) or "an unknown key"
+    return f"run {getattr(target, 'name', '')} was made by {owner}; its owner may, and a key with all queues"
 
 
-def _whose(thing: Object) -> str:
-    match thing:
+def _owner_of(target: Object) -> str:
+    match target:
         case Job():
-            return f"job {named(thing.name, thing.id)} belongs to job queue {thing.queue}"
+            return f"job {named(target.name, target.id)} belongs to job queue {target.queue}"
         case RunRecord():
-            return f"run {thing.name} belongs to {f'job queue {thing.queue}' if thing.queue else 'no known job queue'}"
+            return (
+                f"run {target.name} belongs to {f'job queue {target.queue}' if target.queue else 'no known job queue'}"
+            )
         case JobsOf():
-            return f"it concerns job queue {thing.queue}"
+            return f"it concerns job queue {target.queue}"
         case Owned():
-            return f"{thing.kind} {thing.name} was created by {thing.owner}"
+            return f"{target.kind} {target.name} was created by {target.owner}"
         case LogGroup():
-            return f"log group {thing.name[:200]} was created by {thing.owner or 'the controller'}"
+            return f"log group {target.name[:200]} was created by {target.owner or 'the controller'}"
         case JobDefinition():
             return (
-                f"job definition {thing.name} was registered by {thing.owner or 'an unknown key'}; register your own "
+                f"job definition {target.name} was registered by {target.owner or 'an unknown key'}; register your own "
                 f"revision, or have it tagged {QUEUES_TAG} with the names of the queues whose keys may submit it"
             )
         case _:

@@ -34,7 +34,7 @@ from orchestrator.services.context import Context, archived
 from orchestrator.services.permissions import JobsOf, Operation
 from orchestrator.services.sources import check_sources, hold_teacher, uses_of
 from orchestrator.services.texts import check_texts
-from orchestrator.spec.evaluations import place_of, wanted_of
+from orchestrator.spec.evaluations import evaluation_settings, place_of
 from shared_store.volume.contents import is_archived
 from shared_store.volume.layout import NAME
 
@@ -233,7 +233,7 @@ def _row(context: Context, submitted: Submission) -> Job:
 
 def _check_automatic(context: Context, submitted: Submission) -> None:
     """Raise ClientError where the actor could not submit the evaluations of this training."""
-    evaluation = wanted_of(submitted.gang.spec)
+    evaluation = evaluation_settings(submitted.gang.spec)
     if evaluation is None:
         return
     place = place_of(submitted.queue.name, evaluation, submitted.share)

@@ -38,7 +38,7 @@ def keep_again(controller: Controller, actor: Actor, run: Run, spec: Mapping[str
         with controller.database.session() as session:
             source = controller.texts.source(session, reference)
             is_known = session.get(KeptText, reference.sha256) is not None
-        if is_known and _is_there(source, reference):
+        if is_known and _exists(source, reference):
             controller.texts.prolong(reference.sha256)
             continue
         try:
@@ -58,7 +58,7 @@ def with_texts(controller: Controller, run: str, spec: Mapping[str, Any]) -> dic
 def _kept(context: Context, reference: Reference) -> KeptText:
     row = context.session.get(KeptText, reference.sha256)
     source = context.controller.texts.source(context.session, reference)
-    if row is None or not context.read(("text", reference.sha256), partial(_is_there, source, reference)):
+    if row is None or not context.read(("text", reference.sha256), partial(_exists, source, reference)):
         raise ClientError(
             f"{reference}: the store keeps no such text; submit the job with the file itself, or upload it first: "
             f"PUT /api/texts/{reference.sha256}"
@@ -66,5 +66,5 @@ def _kept(context: Context, reference: Reference) -> KeptText:
     return row
 
 
-def _is_there(folder: Path, reference: Reference) -> bool:
+def _exists(folder: Path, reference: Reference) -> bool:
     return (folder / reference.sha256).is_file()

@@ -53,7 +53,7 @@ def _kept(trained: Mapping[str, Any]) -> dict[str, Any]:
     return {key: trained[key] for key in keys if trained.get(key) is not None}
 
 
-def wanted_of(spec: Mapping[str, Any] | None) -> Evaluation | None:
+def evaluation_settings(spec: Mapping[str, Any] | None) -> Evaluation | None:
     """The section ``evaluation`` of a training's spec; None where there is none. Raises SpecError: a job of the Batch API may say anything."""
     section, train = (spec or {}).get("evaluation"), (spec or {}).get("train")
     if section is None or not isinstance(train, dict) or not isinstance(train.get("iterations"), int):
@@ -66,16 +66,16 @@ def wanted_of(spec: Mapping[str, Any] | None) -> Evaluation | None:
         raise SpecError(f"{key}: {explain(first)}") from None
 
 
-def place_of(queue: str, wanted: Evaluation, share: str | None = None) -> dict[str, str]:
+def place_of(queue: str, settings: Evaluation, share: str | None = None) -> dict[str, str]:
     """Queue and share of a training's automatic evaluations: ``queue`` and ``share``, the training's, unless the section names a queue."""
-    asked = {"queue": wanted.queue, "share": wanted.share}
-    if wanted.queue is None:
-        asked = {"queue": queue, "share": wanted.share or share}
-    return {key: value for key, value in asked.items() if value is not None}
+    requested = {"queue": settings.queue, "share": settings.share}
+    if settings.queue is None:
+        requested = {"queue": queue, "share": settings.share or share}
+    return {key: value for key, value in requested.items() if value is not None}
 
 
 def automatic_evaluation(
-    run: str, trained: Mapping[str, Any], place: Mapping[str, str], wanted: Evaluation, iteration: int
+    run: str, trained: Mapping[str, Any], place: Mapping[str, str], settings: Evaluation, iteration: int
 ) -> Spec:
     """The job that evaluates a checkpoint beside its training. Trainings may take its place, and it keeps no checkpoint. Raises SpecError.
 
@@ -83,16 +83,16 @@ def automatic_evaluation(
     """
     section: dict[str, Any] = {
         "checkpoint": iteration,
-        "episodes": wanted.episodes,
-        "worlds": wanted.worlds,
+        "episodes": settings.episodes,
+        "worlds": settings.worlds,
         "keep": False,
     }
     if (trained.get("train") or {}).get("accept_changed_robot"):
         section["accept_changed_robot"] = True
     document = evaluation_document(run, {**trained, "queue": None}, section)
-    if wanted.resources is not None:
-        document["resources"] = wanted.resources.model_dump()
-    document |= {"retry": wanted.retry.model_dump(), "preemptible": True, **place}
+    if settings.resources is not None:
+        document["resources"] = settings.resources.model_dump()
+    document |= {"retry": settings.retry.model_dump(), "preemptible": True, **place}
     return validate(document, f"evaluation of {run}")
 
 

@@ -76,8 +76,10 @@ class PolicyNode:
         Refused: The policy needs a quantity that no message has, or a setting does not fit.
     """
 
-    def __init__(self, bundle: Bundle, settings: Settings, policy: Policy, tell: Callable[[str], None] = print) -> None:
-        self.settings, self._tell, self._print = settings, tell, tell
+    def __init__(
+        self, bundle: Bundle, settings: Settings, policy: Policy, report: Callable[[str], None] = print
+    ) -> None:
+        self.settings, self._report, self._print = settings, report, report
         contract = bundle.contract
         self.rate = settings.rate or contract.control_hz
         self.messages = Messages(settings.distro)
@@ -107,20 +109,20 @@ class PolicyNode:
     def run(self) -> None:
         """Run the node until :attr:`stopping` is set, or the duration is over. Raises Refused if Zenoh can't be opened."""
         settings, lines = self.settings, Lines(self._print)
-        self._tell = lines.say
+        self._report = lines.say
         with open_session(settings.connect, settings.listen) as session:
             self._node = node = Node(session, self.messages, settings.domain, settings.namespace, settings.name)
             try:
                 self._connect(node)
                 if settings.listen is None and not session.info.routers_zid():
-                    self._tell(
+                    self._report(
                         f"no router answers at {settings.connect}; it is tried again (start rmw_zenohd, or give --listen)"
                     )
                 self._loop()
             finally:
                 self.runner.end("the node ends")
                 self._flush()
-                self._tell(self.summary())
+                self._report(self.summary())
                 lines.close()
                 node.close()
 
@@ -137,15 +139,15 @@ class PolicyNode:
         self._diagnostics = node.publisher("/diagnostics", DIAGNOSTICS)
         node.watch_graph()
 
-        def heard(data: bytes, kind: str, type_hash: str) -> None:
+        def receive(data: bytes, kind: str, type_hash: str) -> None:
             if kind == EMPTY:
                 self._request_reset()
 
-        node.subscribe("~/reset", EMPTY, heard)
+        node.subscribe("~/reset", EMPTY, receive)
         node.serve("~/reset", RESET, self._request_reset)
         for each in self.inputs.all:
             node.subscribe(topics[each.topic], each.kind, self.inputs.hear(each, topics[each.topic]))
-        self._tell(f"node {node.full_name('~/')[:-1]} of domain {node.domain}: {', '.join(topics.values())} -> {out}")
+        self._report(f"node {node.full_name('~/')[:-1]} of domain {node.domain}: {', '.join(topics.values())} -> {out}")
 
     def _request_reset(self, answer: Answer | None = None) -> None:
         if answer is not None:
@@ -184,7 +186,7 @@ class PolicyNode:
                 self._report_missing()
             if now > report:
                 report = now + REPORT
-                self._tell(self.summary())
+                self._report(self.summary())
                 self._check_rates(now)
 
     def _wait(self, period: float) -> float | None:
@@ -220,7 +222,7 @@ class PolicyNode:
     def _flush(self) -> None:
         lines, self._lines = self._lines, []
         for line, warning in lines:
-            self._tell(line)
+            self._report(line)
             place = {"name": self._node.name, "file": "", "function": "", "line": 0}
             stamp = self.messages.stamp(time.time_ns())
             self._log.publish(self.messages.make(LOG, stamp=stamp, level=30 if warning else 20, msg=line, **place))
@@ -253,7 +255,7 @@ class PolicyNode:
                 how = f"nobody publishes it; it may be {others[0]}: --remap {each.topic}:={others[0]}"
             else:
                 how = "nobody publishes it"
-            self._tell(f"waiting for {topic} ({each.kind}): {how}")
+            self._report(f"waiting for {topic} ({each.kind}): {how}")
 
     def _check_rates(self, now: float) -> None:
         """Warn if control steps or joint states come less often than in the policy's training."""

@@ -55,8 +55,8 @@ class Lines:
         tell: Called with each line.
     """
 
-    def __init__(self, tell: Callable[[str], None]) -> None:
-        self._tell = tell
+    def __init__(self, report: Callable[[str], None]) -> None:
+        self._report = report
         self._waiting: queue.Queue[str | None] = queue.Queue(MOST)
         self._thread = threading.Thread(target=self._work, name="lines", daemon=True)
         self._thread.start()
@@ -78,4 +78,4 @@ class Lines:
 
     def _work(self) -> None:
         while (line := self._waiting.get()) is not None:
-            self._tell(line)
+            self._report(line)

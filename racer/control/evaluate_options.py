@@ -20,7 +20,7 @@ _RACE = "Race"
 
 def race_or_evaluate(
     evaluate: Callable[..., None],
-    given: dict[str, Any],
+    supplied: dict[str, Any],
     *,
     race: Annotated[
         bool,
@@ -64,27 +64,27 @@ def race_or_evaluate(
 ) -> None:
     """Evaluate a checkpoint, or have it drive a race. Raises what :func:`.follow_evaluation` raises."""
     rules = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None, "output": output}
-    _refuse_mixed(race, {"episodes": given["episodes"], "worlds": given["worlds"]}, rules)
+    _refuse_mixed(race, {"episodes": supplied["episodes"], "worlds": supplied["worlds"]}, rules)
     if not race:
-        evaluate(**given)
+        evaluate(**supplied)
         return
     for existing in () if output is None else (output / each for each in (SIM_TRACE, *BESIDE)):
         if existing.exists():
             raise UsageError(f"-o {output}: {existing} exists; name another directory")
     section = {
-        "seed": given["seed"],
+        "seed": supplied["seed"],
         "trials": trials,
         "continuous": continuous,
         "track": track or None,
         "off_track_penalty": penalty,
         "crash_penalty": penalty,
-        "accept_changed_robot": given["accept_changed_robot"] or None,
+        "accept_changed_robot": supplied["accept_changed_robot"] or None,
     }
     place = {
-        key: given[key]
+        key: supplied[key]
         for key in ("source", "name", "engine", "store", "cpus", "as_json", "queue", "follow", "dry_run")
     }
-    request = EvaluationRequest(section=section, changes=given["set_"] or (), kind="race", **place)
+    request = EvaluationRequest(section=section, changes=supplied["set_"] or (), kind="race", **place)
 
     def copy(run: Path, evaluation: str) -> None:
         if output is not None:

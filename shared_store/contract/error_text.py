@@ -74,9 +74,9 @@ def explain(problem: Mapping[str, Any]) -> str:
     return f"{message.replace('Input should be', 'expected a value', 1)}, found {shown(found)}"
 
 
-def counted(count: int, thing: str, things: str = "") -> str:
+def counted(count: int, noun: str, plural: str = "") -> str:
     """A count with its noun: ``1 episode``, ``100 episodes``; ``things``: an irregular plural."""
-    return f"{count} {thing if count == 1 else things or f'{thing}s'}"
+    return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 
 def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: float = 0.5) -> str:

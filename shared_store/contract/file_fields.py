@@ -32,14 +32,14 @@ class KeptFile:
     form: Literal["text", "json"]
     check: str = ""
     needs: tuple[str, ...] = ()
-    given: tuple[str, ...] = ()
+    supplied: tuple[str, ...] = ()
 
 
 def kept_file(
-    form: Literal["text", "json"], check: str = "", needs: tuple[str, ...] = (), given: tuple[str, ...] = ()
+    form: Literal["text", "json"], check: str = "", needs: tuple[str, ...] = (), supplied: tuple[str, ...] = ()
 ) -> Mapping[str, Any]:
     """The metadata of such a field; for the arguments see :class:`KeptFile`."""
-    return {_KEY: KeptFile(form, check, needs, given)}
+    return {_KEY: KeptFile(form, check, needs, supplied)}
 
 
 def kept_files(kind: Any) -> dict[str, KeptFile]:

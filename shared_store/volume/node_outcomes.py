@@ -54,7 +54,7 @@ class Outcome:
     started: float
     ended: float
     """Unix times [s] of the first rank's start and of the last rank's end."""
-    asked: bool = False
+    requested: bool = False
     """Whether its ranks ended on request, so that the cause of the gang's end is elsewhere. Outcomes of older versions lack it."""
     cannot_start: bool = False
     """Whether its program could not be started. Outcomes of older versions lack it."""
@@ -95,6 +95,7 @@ def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:
 
 def parse_outcome(value: dict[str, Any]) -> Outcome:
     """The outcome from its ``asdict`` form, with bounded texts. Raises ValueError if it is damaged."""
+    value = {"requested" if key == "asked" else key: each for key, each in value.items()}  # an older version's name
     outcome: Outcome = parse(Outcome, {**value, "error": value.get("error") or None}, "outcome")
     error = outcome.error
     times = (outcome.started, outcome.ended, error.time if error else 0)

@@ -21,7 +21,7 @@ _FIXED = (errno.EACCES, errno.EPERM, errno.EBUSY, errno.EXDEV)
 """Errors that say something of one directory: it may not be written, or another volume is mounted there."""
 
 
-def throw_away(store: Store, paths: Iterable[Path]) -> tuple[list[Path], dict[Path, OSError]]:
+def discard(store: Store, paths: Iterable[Path]) -> tuple[list[Path], dict[Path, OSError]]:
     """Move directories of the store into the trash, durably.
 
     Args:

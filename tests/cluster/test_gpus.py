@@ -78,12 +78,12 @@ def test_every_rank_has_its_own_gpu_and_nccl_works_between_nodes(serving: Servin
     script.write_text(SCRIPT)
     spec.write_text(f"name: gpus\nnodes: 2\nresources: {{gpus: {EACH}, cpus: 1}}\ncommand: [python3, {script}]\n")
     job = submit(serving, str(spec))
-    told = sorted(line.split() for line in serving.log(job) if line.startswith("rank "))
-    assert [line[:4] for line in told] == [["rank", str(rank), "of", str(2 * EACH)] for rank in range(2 * EACH)]
-    used = [line[-1] for line in told]
-    assert len(set(used)) == 2 * EACH, told
-    visible = [line[5] for line in told]
-    assert all(len(each.split(",")) == EACH for each in visible) and len(set(visible)) == 2, told
+    reported = sorted(line.split() for line in serving.log(job) if line.startswith("rank "))
+    assert [line[:4] for line in reported] == [["rank", str(rank), "of", str(2 * EACH)] for rank in range(2 * EACH)]
+    used = [line[-1] for line in reported]
+    assert len(set(used)) == 2 * EACH, reported
+    visible = [line[5] for line in reported]
+    assert all(len(each.split(",")) == EACH for each in visible) and len(set(visible)) == 2, reported
     if serving.options[1] == "local":
         assert visible == [",".join(node["gpus"]) for node in nodes(serving, job) for _ in range(EACH)]
 
@@ -101,9 +101,9 @@ def test_two_hosts_train_over_tcp_lose_a_rank_and_resume(tmp_path: Path) -> None
     settings = {"task": "Cartpole", "worlds": 512, "iterations": 60, "every": 20}
 
     def start(epoch: int, **env: str) -> list[subprocess.Popen[str]]:
-        given = {**training(tmp_path, epoch=epoch, **settings), "NCCL_DEBUG": "INFO", **env}
+        supplied = {**training(tmp_path, epoch=epoch, **settings), "NCCL_DEBUG": "INFO", **env}
         arguments = ["-m", "worker.train"]
-        return start_ranks(arguments, 2 * EACH, given, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+        return start_ranks(arguments, 2 * EACH, supplied, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
     with contextlib.ExitStack() as stack:
         try:
@@ -114,18 +114,18 @@ def test_two_hosts_train_over_tcp_lose_a_rank_and_resume(tmp_path: Path) -> None
         run.create({"run": "run"})
         raise_epoch(run, 1)
         first = start(1, MUSTER_KILL_AT="30")
-        said = [process.communicate(timeout=NOTICED)[0] for process in first]
-        assert first[0].returncode == -signal.SIGKILL, said[0][-2000:]
+        output = [process.communicate(timeout=NOTICED)[0] for process in first]
+        assert first[0].returncode == -signal.SIGKILL, output[0][-2000:]
         assert first[1].returncode not in (0, -signal.SIGKILL), "the other host's rank noticed"
-        ways = set(re.findall(r" via (\S+)", said[0]))
-        assert any(way.startswith("NET/Socket") for way in ways), said[0][-2000:]
+        ways = set(re.findall(r" via (\S+)", output[0]))
+        assert any(way.startswith("NET/Socket") for way in ways), output[0][-2000:]
         assert not any(way.startswith(("P2P", "SHM")) for way in ways), ways
         assert [checkpoint.iteration for checkpoint in list_checkpoints(run)] == [20]
         raise_epoch(run, 2)
         second = start(2)
-        said = [process.communicate(timeout=60 * PATIENCE)[0] for process in second]
-        assert [process.returncode for process in second] == [0] * len(second), said[0][-2000:]
-        assert "resumed from checkpoint 00000020" in said[0]
+        output = [process.communicate(timeout=60 * PATIENCE)[0] for process in second]
+        assert [process.returncode for process in second] == [0] * len(second), output[0][-2000:]
+        assert "resumed from checkpoint 00000020" in output[0]
         assert list_checkpoints(run)[-1].iteration == 60
 
 

@@ -61,9 +61,9 @@ def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_ar
     for index in range(3):
         lines = (bench.store.path / f"env-{index}").read_text().splitlines()
         found = dict(line.split("=", 1) for line in lines if "=" in line)
-        told = plan.nodes[index].contract.to_env()
-        told["MASTER_PORT"] = found["MASTER_PORT"]
-        assert {name: found.get(name) for name in told} == told
+        reported = plan.nodes[index].contract.to_env()
+        reported["MASTER_PORT"] = found["MASTER_PORT"]
+        assert {name: found.get(name) for name in reported} == reported
         assert found["MASTER_ADDR"] == at["n2"] and found["GREETING"] == "hello"
         assert not [name for name in found if name.startswith("RAY_")], "the cluster's token is not for jobs"
         assert found["CUDA_VISIBLE_DEVICES"] in ("0", "1") and status[index].gpus == (found["CUDA_VISIBLE_DEVICES"],)
@@ -88,9 +88,9 @@ def test_what_the_driver_is_told_is_the_request_of_the_plan(bench: RayBench) -> 
     gang = bench.gang(nodes=2, main=1, bus="tcp/127.0.0.1:1", bus_token="the credential")
     plan = bench.engine.plan(gang)
     bench.ready(gang)
-    told = json.loads(Folder.of(bench.engine.home, gang.job).plan(gang.name).read_bytes())
-    assert told == json.loads(json.dumps(plan.request.document())) and told["nodes"][0]["contract"]["bus_token"]
-    for node in told["nodes"]:
+    reported = json.loads(Folder.of(bench.engine.home, gang.job).plan(gang.name).read_bytes())
+    assert reported == json.loads(json.dumps(plan.request.document())) and reported["nodes"][0]["contract"]["bus_token"]
+    for node in reported["nodes"]:
         assert f'{{"ray.io/node-id": "{node["pin"]}"}}' in plan.document
     assert "the credential" not in plan.document
 
@@ -303,7 +303,7 @@ def test_a_raylet_that_freezes_is_given_up_and_what_it_ran_ends(bench: RayBench)
     os.kill(raylet, signal.SIGSTOP)
     try:
         wait_for(lambda: not status_of(bench.engine, handle)[2].running, 100, "Ray gives it up")
-        assert bench.stopped_there(handle) == [143, 143]
+        assert bench.stopped_existing(handle) == [143, 143]
         wait_for(lambda: not processes_of(bench.store.path), 40, "the node that nobody reaches ends itself")
     finally:
         os.kill(raylet, signal.SIGCONT)

@@ -77,13 +77,13 @@ def test_a_rank_that_lives_on_under_a_dead_slurmd_writes_nothing_once_the_next_a
         before = log.stat().st_size
         wait_for(lambda: log.stat().st_size > before, 10, "and it still writes")
         # its machine hangs while the next attempt begins
-        there = [*alive, *bench.processes("for number in range")]
-        signal_all(there, signal.SIGSTOP)
+        existing = [*alive, *bench.processes("for number in range")]
+        signal_all(existing, signal.SIGSTOP)
         time.sleep(1.1)
         second = bench.ready(bench.gang(nodes=2, attempt=2, options={"exclude": "n2"}))
         size, checkpoints = log.stat().st_size, [checkpoint.name for checkpoint in list_checkpoints(bench.run)]
-        signal_all(reversed(there), signal.SIGCONT)
-        wait_for(lambda: not set(there) & set(bench.cluster.processes()), 20, "it has read the new epoch and left")
+        signal_all(reversed(existing), signal.SIGCONT)
+        wait_for(lambda: not set(existing) & set(bench.cluster.processes()), 20, "it has read the new epoch and left")
         assert log.stat().st_size == size, "not a line"
         assert [checkpoint.name for checkpoint in list_checkpoints(bench.run)] == checkpoints, "and no checkpoint"
         assert read_outcome(bench.run, bench.job, 1, 1) is None

@@ -32,8 +32,8 @@ def test_a_training_is_watched_in_its_page_and_the_viewer_ends_with_it(server: S
     expect(page.frame_locator("iframe.view").locator("canvas").first).to_be_visible()
     frame.scroll_into_view_if_needed()
     person.picture("live-view")
-    assert all(each.startswith(("http://127.", "data:", "blob:")) for each in person.asked), "nobody else is asked"
-    assert any(each.startswith(f"{viewer[0]}/re_viewer") for each in person.asked)
+    assert all(each.startswith(("http://127.", "data:", "blob:")) for each in person.requested), "nobody else is asked"
+    assert any(each.startswith(f"{viewer[0]}/re_viewer") for each in person.requested)
     policy = person.page.request.get(f"/jobs/{job}").headers["content-security-policy"]
     assert f"frame-src 'self' {viewer[0]};" in policy and "unsafe" not in policy
     framed = person.page.request.get(f"{viewer[0]}/?url=x").headers["content-security-policy"]

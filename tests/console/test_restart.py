@@ -34,8 +34,8 @@ def test_no_line_is_lost_when_the_server_is_killed_while_two_people_look(server:
     expect(page.locator(".headline .badge")).to_have_text("SUCCEEDED")
     expect(row).to_have_text("SUCCEEDED")
     expect(page.get_by_role("log")).to_contain_text(f"line {LINES - 1}")
-    said = page.locator("[data-log] .line").all_text_contents()
-    numbers = [int(found[1]) for each in said if (found := re.search(r"\bline (\d+)$", each))]
+    output = page.locator("[data-log] .line").all_text_contents()
+    numbers = [int(found[1]) for each in output if (found := re.search(r"\bline (\d+)$", each))]
     assert numbers == list(range(LINES)), "every line once, in its order"
     for each in (reader, watcher):
         expect(each.page.locator("[data-link]")).to_be_hidden()

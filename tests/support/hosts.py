@@ -42,7 +42,7 @@ def start_ranks(
     processes = []
     for rank in range(gpus):
         host, local = divmod(rank, each)
-        given = {
+        supplied = {
             "RANK": str(rank),
             "WORLD_SIZE": str(gpus),
             "LOCAL_RANK": str(local),
@@ -59,7 +59,7 @@ def start_ranks(
         }
         command = ["ip", "netns", "exec", NAMES[host], sys.executable, *arguments]
         processes.append(
-            subprocess.Popen(command, env={**os.environ, **given, **env}, text=True, stdout=stdout, stderr=stderr)
+            subprocess.Popen(command, env={**os.environ, **supplied, **env}, text=True, stdout=stdout, stderr=stderr)
         )
     return processes
 

@@ -104,13 +104,13 @@ class Wired:
 
     def act(self, action: Sequence[float]) -> None:
         """Let the robot do what the policy asks for, by joint commands."""
-        asked = np.asarray(action, np.float32)
-        self.observations.acted(asked)
-        for message in self.commands.joint_states(self.commands.command(asked), self.messages, 0):
+        requested = np.asarray(action, np.float32)
+        self.observations.acted(requested)
+        for message in self.commands.joint_states(self.commands.command(requested), self.messages, 0):
             data = self.messages.encode(message, "sensor_msgs/msg/JointState")
-            heard = self.messages.decode(data, "sensor_msgs/msg/JointState")
-            values = next(each for each in (heard.position, heard.velocity, heard.effort) if len(each))
-            self.actions = self.robot.actions(list(heard.name), values, self.actions)
+            received = self.messages.decode(data, "sensor_msgs/msg/JointState")
+            values = next(each for each in (received.position, received.velocity, received.effort) if len(each))
+            self.actions = self.robot.actions(list(received.name), values, self.actions)
         self.robot.task.step(self.actions)
         if bool(self.robot.task.dones[0]):
             self.observations.reset()
@@ -128,9 +128,9 @@ def assert_sees_what_the_task_sees(wired: Wired, steps: int, size: float) -> int
     names = {group.input: group.name for group in wired.contract.groups}
     for step in range(steps):
         for name, found in wired.observed().items():
-            wanted = task.groups[names[name]][:1].numpy()
-            assert found.dtype == wanted.dtype and found.shape == wanted.shape
-            np.testing.assert_allclose(found, wanted, rtol=1e-5, atol=1e-5, err_msg=f"{name} in step {step}")
+            requested = task.groups[names[name]][:1].numpy()
+            assert found.dtype == requested.dtype and found.shape == requested.shape
+            np.testing.assert_allclose(found, requested, rtol=1e-5, atol=1e-5, err_msg=f"{name} in step {step}")
         action = random.uniform(-size, size, task.action_size)
         wired.act(action)
         np.testing.assert_allclose(task.actions[0].numpy(), action, rtol=1e-5, atol=1e-5)

@@ -74,26 +74,26 @@ def _items(pid: int, file: str) -> list[str]:
 # -- finding ----------------------------------------------------------------------------------------------------------
 
 
-def find_processes(is_wanted: Callable[[int], bool]) -> list[int]:
+def find_processes(is_expected: Callable[[int], bool]) -> list[int]:
     """Pids of all living processes that are wanted, this one left out."""
     pids = [int(entry) for entry in os.listdir("/proc") if entry.isdigit()]
-    return [pid for pid in pids if pid != os.getpid() and is_wanted(pid) and alive(pid)]
+    return [pid for pid in pids if pid != os.getpid() and is_expected(pid) and alive(pid)]
 
 
 def processes_of(home: Path, **variables: str) -> list[int]:
     """Pids of all whose environment names a store below ``home``, and has these variables."""
 
-    def is_wanted(pid: int) -> bool:
+    def is_expected(pid: int) -> bool:
         found = environment(pid)
         return f"{found.get('MUSTER_STORE')}/".startswith(f"{home}/") and variables.items() <= found.items()
 
-    return find_processes(is_wanted)
+    return find_processes(is_expected)
 
 
 def processes_of_job(job: str, **variables: str) -> list[int]:
     """Pids of all that carries the job's id, and these variables, on this machine: in containers, too."""
-    wanted = {"MUSTER_JOB_ID": job, **variables}.items()
-    return find_processes(lambda pid: wanted <= environment(pid).items())
+    requested = {"MUSTER_JOB_ID": job, **variables}.items()
+    return find_processes(lambda pid: requested <= environment(pid).items())
 
 
 def processes_running(text: str) -> list[int]:

@@ -89,8 +89,8 @@ def _declared(statement: nodes.Statement) -> nodes.Statement:
 
 
 def _array(context: AnalyzeTypeContext) -> types.Type:
-    api, given = context.api, context.type.args
-    element = api.analyze_type(given[0]) if given else types.AnyType(types.TypeOfAny.from_omitted_generics)
+    api, supplied = context.api, context.type.args
+    element = api.analyze_type(supplied[0]) if supplied else types.AnyType(types.TypeOfAny.from_omitted_generics)
     return api.named_type(ARRAY, [element, api.named_type("builtins.int", [])])
 
 

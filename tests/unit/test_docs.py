@@ -36,10 +36,10 @@ def test_every_link_of_a_page_leads_to_a_file_and_a_heading(page: Path) -> None:
         if target.startswith(("http://", "https://")):
             continue
         path, _, anchor = target.partition("#")
-        there = (page.parent / path).resolve() if path else page
-        assert there.exists(), f"{target}: there is no such file"
+        existing = (page.parent / path).resolve() if path else page
+        assert existing.exists(), f"{target}: there is no such file"
         if anchor:
-            assert anchor in anchors(there), f"{target}: no such heading"
+            assert anchor in anchors(existing), f"{target}: no such heading"
 
 
 def test_every_page_can_be_reached_from_the_readme() -> None:

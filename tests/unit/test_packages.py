@@ -21,7 +21,7 @@ FORBIDDEN = {
     "policy_node": HEAVY | {"worker", "orchestrator", "shared_store"},
     "racer": {"muster_policy"},
 }
-THERE = [package for package in FORBIDDEN if (REPOSITORY / package).is_dir()]
+EXISTING = [package for package in FORBIDDEN if (REPOSITORY / package).is_dir()]
 """The racer may have been removed: ``make without-racer``."""
 LIGHT_IN_WORKER = ("node", "supervisor.py", "slurm_node.py", "aws_node.py", "__init__.py")
 
@@ -74,7 +74,7 @@ def sources(package: str) -> list[Path]:
     return [path for path in sorted(root.rglob("*.py")) if path.relative_to(root).parts[0] != "build"]
 
 
-@pytest.mark.parametrize("package", THERE)
+@pytest.mark.parametrize("package", EXISTING)
 def test_no_module_imports_what_its_room_may_not(package: str) -> None:
     modules = sources(package)
     assert len(modules) > 5
@@ -144,7 +144,7 @@ def test_help_imports_no_command_and_each_says_what_its_own_help_says() -> None:
 
 
 def test_no_module_is_too_long_to_be_seen_whole() -> None:
-    for package in (*THERE, "tests", "benchmarks", "docs"):
+    for package in (*EXISTING, "tests", "benchmarks", "docs"):
         for module in sources(package):
             assert len(module.read_text().splitlines()) <= 450, module
 
@@ -183,7 +183,7 @@ def room_of(parts: tuple[str, ...], rooms: set[str]) -> str:
     return two if two in rooms else parts[0] if parts else ""
 
 
-@pytest.mark.parametrize("package", [package for package in FLOORS if package in THERE])
+@pytest.mark.parametrize("package", [package for package in FLOORS if package in EXISTING])
 def test_no_import_of_a_room_climbs(package: str) -> None:
     level = {room: number for number, floor in enumerate(FLOORS[package]) for room in floor}
     for module in sources(package):
@@ -197,7 +197,7 @@ def test_no_import_of_a_room_climbs(package: str) -> None:
                     assert own == other or level[other] < level[own], (module, name)
 
 
-@pytest.mark.skipif("racer" not in THERE, reason="the racer is removed")
+@pytest.mark.skipif("racer" not in EXISTING, reason="the racer is removed")
 def test_the_racer_in_the_controller_imports_neither_torch_nor_numpy() -> None:
     rooms = {room for floor in RACER_FLOORS for room in floor} | {"control"}
     control = sorted((REPOSITORY / "racer" / "control").glob("*.py"))

@@ -51,9 +51,9 @@ def test_a_fault_beside_a_kernel_is_reported_and_one_in_its_body_is_not(
     monkeypatch.chdir(REPOSITORY)
     for count in ("3", "3.0"):  # the second time the module is in mypy's cache, and what it imports has changed
         numbers.write_text(f"COUNT = {count}\n")
-        told, errors, code = api.run([str(kernels), str(numbers), "--no-error-summary"])
+        reported, errors, code = api.run([str(kernels), str(numbers), "--no-error-summary"])
         assert not errors
         assert code == 1
         lines = enumerate(MODULE.split("\n"), 1)
         expected = [(str(number), line.split("# ")[1]) for number, line in lines if "# " in line]
-        assert re.findall(r"some_kernels\.py:(\d+): error: .*\[(.+)\]", told) == expected
+        assert re.findall(r"some_kernels\.py:(\d+): error: .*\[(.+)\]", reported) == expected

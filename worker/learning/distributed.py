@@ -116,7 +116,7 @@ class Gang:
         dist.all_reduce(tensor, op=dist.ReduceOp.MAX)
         return int(tensor.item())
 
-    def tell(self, text: str | None) -> str | None:
+    def broadcast_text(self, text: str | None) -> str | None:
         """The main rank's ``text``, on every rank. Raises GangError if the main rank has ended."""
         if self.store is None:
             return text

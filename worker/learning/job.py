@@ -57,12 +57,12 @@ class StopRequest:
 
         The thread hears of the signal also while the main thread is inside a library's call, where Python runs no handlers.
         """
-        heard, write_end = os.pipe()
+        read_end, write_end = os.pipe()
         os.set_blocking(write_end, False)
         signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
 
         def wait() -> None:
-            while not self.requested and not {signal.SIGTERM, signal.SIGINT} & set(os.read(heard, 64)):
+            while not self.requested and not {signal.SIGTERM, signal.SIGINT} & set(os.read(read_end, 64)):
                 pass
             time.sleep(seconds)
             late()

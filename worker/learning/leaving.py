@@ -67,7 +67,7 @@ def complete(loop: Loop) -> str:
             state.save(loop.reporter if gang.is_main else None)
         is_ordered = False
         loop.report_saves(state.finish())
-        name = gang.tell(state.saved_at) or ""
+        name = gang.broadcast_text(state.saved_at) or ""
         if name.startswith(f"{state.progress.iteration:08d}-"):
             return name
         loop.say(f"training is done, and its last checkpoint is not saved yet; trying again in {pause} s")

@@ -35,7 +35,7 @@ from worker.learning.setup import (
     write_contract,
 )
 from worker.learning.state import EndedEpisodes, TrainingState
-from worker.learning.training import Training, as_begun
+from worker.learning.training import Training, as_started
 from worker.settings.errors import TrainingError, UserError
 from worker.settings.task import value_at
 
@@ -56,7 +56,7 @@ class Loop:
 
         Raises UserError for settings that the task refuses, and for a checkpoint that does not fit.
         """
-        training, self._earlier_settings = as_begun(training, gang)
+        training, self._earlier_settings = as_started(training, gang)
         job = training.job
         self.training, self.job, self.config, self.gang, self.stop = training, job, training.config, gang, stop
         own = [FaultInjection(os.environ, job)] if gang.is_main else []
@@ -202,7 +202,7 @@ class Loop:
         """Log the results of saves."""
         for line in filter(None, lines):
             self.reporter.do(_print, line)
-            self.beacon.send(said=line)
+            self.beacon.send(message=line)
 
     def _iterate(self) -> tuple[dict[str, Any], dict[str, float]]:
         """One iteration; its numbers (all ranks together), and the sums of :data:`SIGNALS` over the ranks."""

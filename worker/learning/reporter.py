@@ -151,7 +151,7 @@ def _warn(error: Exception) -> None:
 
 class Beacon:
     """Messages of a rank to its supervisor, one JSON line each on an inherited pipe: ``phase``
-    (:class:`shared_store.contract.phases.Phase`), ``iteration`` and ``steps_per_second``, ``said`` (of a save), ``done``.
+    (:class:`shared_store.contract.phases.Phase`), ``iteration`` and ``steps_per_second``, ``message`` (of a save), ``done``.
 
     A message that finds the pipe full is dropped: the supervisor needs the newest, and the loop must not wait for it.
     Without a supervisor (torchrun, a debugger) nothing is sent.

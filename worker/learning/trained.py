@@ -49,9 +49,9 @@ def chosen_by_main(
             name = found.name if found else None
         except errors as error:
             problem = str(error)
-    if problem := gang.tell(problem) or "":
+    if problem := gang.broadcast_text(problem) or "":
         return None, problem
-    return checkpoint_called(folder, gang.tell(name) or ""), ""
+    return checkpoint_called(folder, gang.broadcast_text(name) or ""), ""
 
 
 def find_checkpoint(run: Run, choice: int | str | None) -> Checkpoint:

@@ -68,7 +68,7 @@ class Training:
         )
 
 
-def as_begun(training: Training, gang: Gang) -> tuple[Training, str]:
+def as_started(training: Training, gang: Gang) -> tuple[Training, str]:
     """``training`` with the settings of the run's newest checkpoint where neither its job nor this one sets them, and a line about them.
 
     Settings that did not exist then have the values that compute the same: those in ``before`` of their class. A clone takes over what
@@ -77,7 +77,7 @@ def as_begun(training: Training, gang: Gang) -> tuple[Training, str]:
     Raises:
         UserError: This job's settings do not fit those.
     """
-    kept = json.loads(gang.tell(json.dumps(_kept(training)) if gang.is_main else None) or "{}")
+    kept = json.loads(gang.broadcast_text(json.dumps(_kept(training)) if gang.is_main else None) or "{}")
     if not kept:
         return training, ""
     now = dataclasses.asdict(training.settings)
@@ -95,15 +95,15 @@ def as_begun(training: Training, gang: Gang) -> tuple[Training, str]:
 def _kept(training: Training) -> dict[str, Any]:
     """The settings that differ from those of today and that nobody set, by name; their values are as in JSON."""
     found = _checkpoint(training.job)
-    there = found[0].manifest if found else {}
-    if not found or there.get("algorithm") != training.algorithm:
+    existing = found[0].manifest if found else {}
+    if not found or existing.get("algorithm") != training.algorithm:
         return {}
     kind: Any = type(training.settings)
     key = f"train.{section_of(training.algorithm)}"
-    set_by_job = {*(setting_at(there, key) or {}), *(training.job.section.get(section_of(training.algorithm)) or {})}
-    then = {**getattr(kind, "before", {}), **(there.get("settings") or {})}
+    set_by_job = {*(setting_at(existing, key) or {}), *(training.job.section.get(section_of(training.algorithm)) or {})}
+    then = {**getattr(kind, "before", {}), **(existing.get("settings") or {})}
     now = json.loads(json.dumps(dataclasses.asdict(training.settings)))
-    names = fixed_settings(kind, there.get("settings") or {}, of_clone=True) if found[1] else now
+    names = fixed_settings(kind, existing.get("settings") or {}, of_clone=True) if found[1] else now
     return {
         name: then[name] for name in names if name not in set_by_job and name in then and then[name] != now.get(name)
     }

@@ -130,7 +130,7 @@ class ChildEnd:
                 self._say(gang=self._contract.gang, node=self._contract.node_index)
         return self._connection is not None
 
-    def tell(self, exit_code: int, reason: str) -> None:
+    def report(self, exit_code: int, reason: str) -> None:
         """The last word: how the node ended."""
         self._say(code=exit_code, reason=reason)
 
@@ -172,11 +172,11 @@ class AwsSupervisor(supervisor.Supervisor):
         if self._loss is None or self.stopping != self._loss.reason:
             return outcome  # a rank of this node was first
         code = outcome.exit_code if outcome.exit_code not in (0, EX_TEMPFAIL) else self._loss.exit_code
-        return replace(outcome, exit_code=code, signal=None, reason=self._loss.reason, error=None, asked=True)
+        return replace(outcome, exit_code=code, signal=None, reason=self._loss.reason, error=None, requested=True)
 
     def _commit(self, outcome: Outcome) -> int:
         if isinstance(self._line, ChildEnd):
-            self._line.tell(outcome.exit_code, outcome.reason)
+            self._line.report(outcome.exit_code, outcome.reason)
         _say(format_line(time.time(), None, "o", OUTCOME_LINE + json.dumps(asdict(outcome))))
         return super()._commit(outcome)
 

@@ -69,7 +69,7 @@ class NodeBus:
         self._node = contract.job, contract.attempt, contract.node_index
         self._prefix = prefix(*self._node)
         self._credential = Credential.parse(contract.bus_token or "")
-        self._heard: set[str] = set()
+        self._received: set[str] = set()
         """Ids of the commands that came: a repeated one is not carried out again."""
         self._session: zenoh.Session | None = None
         self._declared: list[Any] = []
@@ -174,7 +174,7 @@ class NodeBus:
             number, proof = request["id"], request["proof"]
         except (AttributeError, ValueError, KeyError):  # AttributeError: no payload
             number, proof = "", None
-        known = not isinstance(number, str) or number in self._heard
+        known = not isinstance(number, str) or number in self._received
         if known or not self._credential.proves(proof, "command", key, number):
             query.drop()
             return
@@ -182,7 +182,7 @@ class NodeBus:
             self._followed_until = time.monotonic() + LOG_LEASE
             query.drop()
             return
-        self._heard.add(number)
+        self._received.add(number)
         self.commands.put(BusCommand(query, self._credential, key, number))
         try:
             os.write(self._wakeup, b"c")

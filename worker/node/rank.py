@@ -47,7 +47,7 @@ class Rank:
         self.running = False
         self.overdue = False
         """Killed because it did not leave in time."""
-        self.asked = False
+        self.requested = False
         """It was asked to end before it was seen to have ended: its end is not the cause of anything."""
         self.stuck: str | None = None
         """Names the processes of it that SIGKILL does not end, and where they are."""
@@ -58,7 +58,7 @@ class Rank:
         """Its stacks when it had made no progress for too long."""
         self.progress: dict[str, Any] = {}
         """The newest of everything that it reported (:class:`worker.learning.reporter.Beacon`)."""
-        self.heard: float | None = None
+        self.received: float | None = None
         """Time of its last message about an iteration (monotonic [s]); None before the first and after the last iteration."""
         self.spoke = time.monotonic()
         """Time of its start or of its last message (monotonic [s])."""
@@ -192,13 +192,13 @@ class Rank:
                 continue
             iteration = message.get("iteration")
             if type(iteration) is int and 0 <= iteration < _LARGEST_NUMBER:
-                self.heard = time.monotonic()
+                self.received = time.monotonic()
             else:
                 message.pop("iteration", None)
             if message.get("done"):
-                self.heard = None
-            if "said" in message:
-                reports.append(str(message.pop("said"))[:_LONGEST_VALUE])
+                self.received = None
+            if "message" in message:
+                reports.append(str(message.pop("message"))[:_LONGEST_VALUE])
             for name, value in message.items():
                 known = name in self.progress or (len(self.progress) < _MOST_VALUES and len(name) <= _LONGEST_VALUE)
                 if known and isinstance(value, str):
@@ -251,7 +251,7 @@ class Rank:
     @property
     def _failed_alone(self) -> bool:
         """Whether the program ended by itself."""
-        return not (self.asked or self.overdue or self.stalled or self.stuck or self.signal_name)
+        return not (self.requested or self.overdue or self.stalled or self.stuck or self.signal_name)
 
     def _traceback(self) -> FirstError | None:
         lines = list(self._stderr)

@@ -53,7 +53,7 @@ _COMMIT_INTERVAL = 1.0
 """Seconds between two tries to write an outcome."""
 _LAST_WORDS = 2.0
 """Seconds before its end of grace at which a node leaves whose outcome can't be written: its exit code must be its own."""
-_ASKED = "asked to leave"
+_REQUESTED = "asked to leave"
 _REQUESTS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 """Signals that ask the node to leave."""
 _STATES = {
@@ -92,7 +92,7 @@ class Supervisor:
         self._wakeup, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         signal.set_wakeup_fd(write_end, warn_on_full_buffer=False)
         for number in _REQUESTS:
-            signal.signal(number, lambda _number, _frame: self.stop(_ASKED, self.contract.grace))
+            signal.signal(number, lambda _number, _frame: self.stop(_REQUESTED, self.contract.grace))
         signal.signal(signal.SIGCHLD, lambda _number, _frame: None)
         self.selector.register(self._wakeup, selectors.EVENT_READ, None)
         self.bus = NodeBus(self.contract, write_end)
@@ -141,7 +141,7 @@ class Supervisor:
         for rank in self.ranks:
             rank.poll()  # one that has ended by itself was not asked
             if rank.running:
-                rank.asked = rank.stalled is None
+                rank.requested = rank.stalled is None
                 kill_group(rank.pid, signal.SIGTERM)
 
     # -- ranks --------------------------------------------------------------------------------------------------------
@@ -195,7 +195,7 @@ class Supervisor:
         if (timeout := self.contract.stall_timeout) is None:
             return False
         # before the first iteration (kernels are compiled) and after the last (evaluation) only the time limits tell a stall
-        since, limit = (rank.heard, timeout) if rank.heard is not None else (rank.spoke, max(timeout, _PATIENCE))
+        since, limit = (rank.received, timeout) if rank.received is not None else (rank.spoke, max(timeout, _PATIENCE))
         if (silence := time.monotonic() - since) < limit:
             return False
         if any(key.data == (rank, "beacon") for key, _ in self.selector.select(0)):
@@ -229,7 +229,7 @@ class Supervisor:
             elif command.name == "stacks":
                 found = []
                 for rank in self.ranks:
-                    title, speaks = f"stacks of rank {rank.number}, asked for:", rank.heard is not None
+                    title, speaks = f"stacks of rank {rank.number}, asked for:", rank.received is not None
                     found += [f"rank {rank.number}:", *self._log_stacks(rank, title, speaks=speaks)]
                 command.reply("\n".join(found))
             elif command.name == "stop":
@@ -241,10 +241,12 @@ class Supervisor:
     def _order_save(self, command: BusCommand) -> None:
         """Ask the ranks to save now (SIGUSR2); the answer follows when the first save after that is durable."""
         rank = self.ranks[0]
-        if rank.running and rank.heard is None and self.contract.stall_timeout is not None:  # which only a training has
+        if (
+            rank.running and rank.received is None and self.contract.stall_timeout is not None
+        ):  # which only a training has
             command.reply(f"job {self.contract.job[:8]} has not begun its first iteration: nothing to save yet")
             return
-        if not rank.running or rank.heard is None:
+        if not rank.running or rank.received is None:
             command.reply("not training: there is nothing to save now")
             return
         self._saving.append((rank.progress["iteration"], command))
@@ -281,7 +283,7 @@ class Supervisor:
     def _lose(self, data: bytes, error: OSError) -> None:
         why = error.strerror or str(error)
         if not self._lost[0] and time.monotonic() >= self._complain:
-            _tell(f"log of node {self.contract.node_index} can't be written: {why}")
+            _log(f"log of node {self.contract.node_index} can't be written: {why}")
             self._complain = time.monotonic() + _COMPLAINTS
         self._lost = (self._lost[0] + data.count(b"\n"), self._lost[1] + len(data), why)
 
@@ -340,7 +342,7 @@ class Supervisor:
         if self._memory.is_used_up():
             return Outcome(node, epoch, 128 + signal.SIGKILL, "SIGKILL", OUT_OF_MEMORY, None, started, time.time())
         failed = [rank for rank in self.ranks if rank.exit_code not in (0, EX_TEMPFAIL)]
-        ends = [(self._was_asked(rank), rank.ended) for rank in failed]
+        ends = [(self._was_requested(rank), rank.ended) for rank in failed]
         first = failed[first_cause(ends)] if failed else None
         if first:
             code, reason, error = first.exit_code, first.reason(self.contract.grace), first.first_error()
@@ -349,12 +351,12 @@ class Supervisor:
         else:
             code, reason, error = 0, "done", None
         name = first.signal_name if first else None
-        asked = self._was_asked(first) if first else any(rank.asked for rank in self.ranks)
-        return Outcome(node, epoch, code, name, reason, error, started, time.time(), asked)
+        requested = self._was_requested(first) if first else any(rank.requested for rank in self.ranks)
+        return Outcome(node, epoch, code, name, reason, error, started, time.time(), requested)
 
-    def _was_asked(self, rank: Rank) -> bool:
+    def _was_requested(self, rank: Rank) -> bool:
         """Some engines send SIGTERM to the ranks themselves, too: one may be gone before this process knows."""
-        return rank.asked or (self.stopping == _ASKED and rank.signal_name == "SIGTERM")
+        return rank.requested or (self.stopping == _REQUESTED and rank.signal_name == "SIGTERM")
 
     def _commit(self, outcome: Outcome) -> int:
         """Write the outcome until it stands, or the node is asked to leave; returns its exit code, by which the engine knows it too.
@@ -364,7 +366,7 @@ class Supervisor:
         with contextlib.suppress(OSError):
             self._log.sync()
         # the time that ranks had to leave is over; whoever asks the node to leave gives it more
-        if self.stopping != _ASKED:
+        if self.stopping != _REQUESTED:
             self.stopping = self.deadline = None
         trouble, store = "", self.run.path.parent.parent
         # a run that was deleted, in a store that is mounted, must not come back in part
@@ -381,10 +383,10 @@ class Supervisor:
             except (OSError, DamagedFile) as error:
                 why = f"outcome of node {outcome.node} can't be written: {getattr(error, 'strerror', None) or error}"
                 if not isinstance(error, OSError) or error.errno in _FINAL:
-                    _tell(why)
+                    _log(why)
                     break
             if why != trouble:
-                _tell(f"{why}; trying again until it can, or the node is asked to leave")
+                _log(f"{why}; trying again until it can, or the node is asked to leave")
                 trouble = why
             if self.deadline is not None and time.monotonic() > self.deadline - _LAST_WORDS:
                 break
@@ -393,7 +395,7 @@ class Supervisor:
         return outcome.exit_code
 
 
-def _tell(text: str) -> None:
+def _log(text: str) -> None:
     """One line on standard error, which may lie on the very volume that is full; nothing is kept to fail again at the exit."""
     with contextlib.suppress(OSError):
         os.write(2, f"{text}\n".encode(errors="backslashreplace"))

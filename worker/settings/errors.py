@@ -26,7 +26,7 @@ class TrainingError(Exception):
 
 def is_out_of_memory(error: BaseException) -> bool:
     """Whether torch, Warp or Python found no memory: torch says so with RuntimeErrors, of which not all have a type of their own."""
-    said = ("Failed to allocate", "out of memory", "can't allocate memory")
+    phrases = ("Failed to allocate", "out of memory", "can't allocate memory")
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(words in str(error) for words in said)
+        isinstance(error, RuntimeError) and any(words in str(error) for words in phrases)
     )

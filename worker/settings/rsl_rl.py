@@ -114,8 +114,8 @@ class RslRlConfig:
             for name in self.obs_groups:
                 if name not in SETS:
                     raise Refused(("obs_groups", name), f"{kind} has no such set; {nearest(name, SETS)}")
-            given = {name: getattr(self, name) for name in NETWORKS}
-            check_networks(kind, kind == "Distillation", given, self.teacher_checkpoint)
+            supplied = {name: getattr(self, name) for name in NETWORKS}
+            check_networks(kind, kind == "Distillation", supplied, self.teacher_checkpoint)
         if kind == "Distillation":
             epochs, length = section.get("num_learning_epochs", 1), section.get("gradient_length", 15)
             check_gradient_length(length, epochs, self.num_steps_per_env)
@@ -127,8 +127,8 @@ class RslRlConfig:
         Args:
             groups: The task's groups, and whether each holds images.
         """
-        for name, wanted in self.obs_groups.items():
-            for group in wanted:
+        for name, requested in self.obs_groups.items():
+            for group in requested:
                 if group not in groups:
                     known = ", ".join(groups)
                     raise ValueError(f"obs_groups: {name}: there is no observation group {group!r}; there are {known}")
@@ -143,10 +143,10 @@ class RslRlConfig:
         return _changed(DEFAULTS[name], getattr(self, name) or {})
 
 
-def _changed(default: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+def _changed(default: Mapping[str, Any], supplied: Mapping[str, Any]) -> dict[str, Any]:
     """A copy of ``given``, or, if it names no class, of ``default`` with its changes."""
-    known: Mapping[str, Any] = {} if "class_name" in given else default
-    return {key: _copy(value, known.get(key)) for key, value in {**known, **given}.items()}
+    known: Mapping[str, Any] = {} if "class_name" in supplied else default
+    return {key: _copy(value, known.get(key)) for key, value in {**known, **supplied}.items()}
 
 
 def _copy(value: Any, default: Any) -> Any:

@@ -140,7 +140,7 @@ def check_finite(value: Any, path: tuple[str | int, ...] = ()) -> Any:
     return value
 
 
-def check_networks(kind: str, distils: bool, given: Mapping[str, Any], teacher: str | None) -> tuple[str, str]:
+def check_networks(kind: str, distils: bool, supplied: Mapping[str, Any], teacher: str | None) -> tuple[str, str]:
     """The names of an algorithm's two networks, the policy first.
 
     Args:
@@ -153,7 +153,7 @@ def check_networks(kind: str, distils: bool, given: Mapping[str, Any], teacher: 
         Refused: A network is not one of the algorithm's, a teacher is missing, or the algorithm has no teacher.
     """
     names = ("student", "teacher") if distils else ("actor", "critic")
-    for other, section in given.items():
+    for other, section in supplied.items():
         if other not in names and section is not None:
             raise Refused((other,), f"{kind} has the networks {' and '.join(names)}")
     if bool(teacher) != distils:

@@ -325,7 +325,7 @@ class TaskConfig(_Common):
         for item in fields(_Common):
             object.__setattr__(self, item.name, getattr(checked, item.name))
         known = self.default_weights
-        given = {} if self.rewards == default_rewards(type(self)) else self.rewards  # none were given
+        supplied = {} if self.rewards == default_rewards(type(self)) else self.rewards  # none were given
         points = self.curriculum.get("level", ())
         if not all(0.0 <= value <= 1.0 for _, value in points):
             raise Refused(("curriculum", "level"), f"expected levels from 0 to 1, found {shown(points)}")
@@ -334,7 +334,7 @@ class TaskConfig(_Common):
             raise Refused(("randomize", scene[0]), f"{type(self).__name__} has no camera that would see it")
         if self.randomize.observation_noise and groups["policy"]:
             raise Refused(("randomize", "observation_noise"), "it is for numbers, not for images; use light and colors")
-        weights = {name: float(weight) for name, weight in {**known, **given}.items()}
+        weights = {name: float(weight) for name, weight in {**known, **supplied}.items()}
         object.__setattr__(self, "rewards", MappingProxyType(weights))
         object.__setattr__(self, "curriculum", MappingProxyType(dict(self.curriculum)))
         object.__setattr__(self, "numbers", MappingProxyType(dict(self.numbers)))

@@ -40,8 +40,8 @@ Stages = Annotated[
 
 def range_at(stages: Sequence[Sequence[float]], iteration: int) -> tuple[float, float]:
     """Least and greatest value in an iteration, counted from 0: those of the last stage that has begun."""
-    begun = [stage for stage in stages if stage[0] <= iteration] or stages[:1]
-    return begun[-1][1], begun[-1][2]
+    started = [stage for stage in stages if stage[0] <= iteration] or stages[:1]
+    return started[-1][1], started[-1][2]
 
 
 def widest(stages: Sequence[Sequence[float]]) -> tuple[float, float]:

@@ -19,7 +19,7 @@ UNSET = -(2**63)
 """Newton's value for a shape without a mask."""
 FIRST_OWN_BIT = 8
 """Each robot without self-collisions takes its own bit, from this one upwards."""
-SOLREF_AS_GIVEN = 1
+SOLREF_AS_WRITTEN = 1
 """Newton's mode of a geom whose ``solref`` is passed to MuJoCo unchanged."""
 SOLIMP_DEFAULT = (0.9, 0.95, 0.001, 0.5, 2.0)
 """MuJoCo's default ``solimp``, which fills in numbers that are not given."""
@@ -183,7 +183,7 @@ def _set_contact(builder: newton.ModelBuilder, shape: int, values: Mapping[str, 
             getattr(builder, f"shape_material_mu{direction}")[shape] = float(coefficient)
     if values["solref"] is not None:
         _values(builder, "solref")[shape] = wp.vec2(*values["solref"])
-        _values(builder, "solref_mode")[shape] = SOLREF_AS_GIVEN
+        _values(builder, "solref_mode")[shape] = SOLREF_AS_WRITTEN
     if values["solimp"] is not None:
         solimp = tuple(values["solimp"]) + SOLIMP_DEFAULT[len(values["solimp"]) :]
         _values(builder, "geom_solimp")[shape] = wp.types.vector(5, wp.float32)(*solimp)

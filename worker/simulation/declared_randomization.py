@@ -152,8 +152,8 @@ class Randomize:
         self._check_parts()
         for axis in (*self.axes, *(self.range if isinstance(self.range, Mapping) else ())):
             if axis not in self.quantity.axes:
-                there = nearest(axis, self.quantity.axes) if self.quantity.axes else "it is one number"
-                raise ValueError(f"{self._where}: it has no axis {axis!r}; {there}")
+                hint = nearest(axis, self.quantity.axes) if self.quantity.axes else "it is one number"
+                raise ValueError(f"{self._where}: it has no axis {axis!r}; {hint}")
         if isinstance(self.range, Mapping) and self.axes and set(self.axes) != set(self.range):
             raise ValueError(f"{self._where}: the range names other axes than axes={self.axes}; leave axes out")
         if isinstance(self.range, Mapping) and not self.range:

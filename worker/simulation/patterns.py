@@ -34,7 +34,7 @@ def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list
     for pattern in chosen:
         matching = {index for index, name in enumerate(names) if name == pattern or fnmatchcase(name, pattern)}
         if not matching:
-            raise ValueError(f"no {what} matches {pattern!r}; {_what_there_is(pattern, names)}")
+            raise ValueError(f"no {what} matches {pattern!r}; {_existing_names(pattern, names)}")
         found |= matching
     return sorted(found)
 
@@ -72,7 +72,7 @@ def resolve(names: Sequence[str], values: Value | Mapping[str, Value], what: str
     return resolved
 
 
-def _what_there_is(pattern: str, names: Sequence[str]) -> str:
+def _existing_names(pattern: str, names: Sequence[str]) -> str:
     everything = f"there are {', '.join(names) or 'none'}"
     simple = pattern.strip("^$").replace(".*", "*")
     if simple != pattern and any(fnmatchcase(name, simple) for name in names):

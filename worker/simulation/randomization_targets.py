@@ -115,12 +115,12 @@ def _of_all_robots(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotVi
     patterns = [pattern] if isinstance(pattern, str) else pattern
     for view in views.values():
         names = view.body_names if parts == "bodies" else view.joint_names
-        there = [index for index, name in enumerate(names) if any(fnmatchcase(name, each) for each in patterns)]
+        existing = [index for index, name in enumerate(names) if any(fnmatchcase(name, each) for each in patterns)]
         if parts == "bodies":
-            there = [body for body in there if masses[view.bodies[body]] > 0.0]
+            existing = [body for body in existing if masses[view.bodies[body]] > 0.0]
         elif parts == "actuators":
-            there = [joint for joint in there if view.actuators[joint] >= 0]
-        own = _of_robot(entry, worlds, view, there)
+            existing = [joint for joint in existing if view.actuators[joint] >= 0]
+        own = _of_robot(entry, worlds, view, existing)
         changes = (dataclasses.replace(each, element=each.element + len(found.names)) for each in own.changes)
         found = EntryTargets((*found.names, *own.names), (*found.changes, *changes))
     if not found.names:
@@ -196,15 +196,15 @@ def _geoms(entry: Randomize, worlds: Worlds, names: list[str], shapes: list[int]
     axes = [(entry.quantity.axes.index(axis), number) for number, axis in enumerate(entry.drawn_axes)]
     if entry.what == "contact_friction":
         axes = [(axis, 0) for axis in range(3)]
-    there = [(name, columns[shape]) for name, shape in zip(names, shapes, strict=True) if shape in columns]
-    if not there:
+    existing = [(name, columns[shape]) for name, shape in zip(names, shapes, strict=True) if shape in columns]
+    if not existing:
         raise ValueError(f"geoms {', '.join(names)} touch nothing, so they have no friction; choose geoms that collide")
     changes = (
         Change("geom_friction", 3 * geom + axis, element, number, least=LEAST_FRICTION)
-        for element, (_, geom) in enumerate(there)
+        for element, (_, geom) in enumerate(existing)
         for axis, number in axes
     )
-    return EntryTargets(tuple(name for name, _ in there), tuple(changes))
+    return EntryTargets(tuple(name for name, _ in existing), tuple(changes))
 
 
 def _joints(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> EntryTargets:

@@ -37,12 +37,12 @@ def displace(
     position: wp.vec3f,
     angle: wp.vec3f,
     episodes: EpisodeArrays,
-    given: wp.array[wp.transformf],
+    supplied: wp.array[wp.transformf],
     poses: wp.array[wp.transformf],
 ):
     """Pose of one world's camera: drawn once from stream ``number``, that is from the seed and the world alone."""
     world = wp.tid()
-    poses[world] = displaced(given[world], numbered_stream(episodes, world, number), position, angle)
+    poses[world] = displaced(supplied[world], numbered_stream(episodes, world, number), position, angle)
 
 
 @wp.kernel

@@ -324,8 +324,8 @@ def urdf_mesh(source: str, name: str, shown: str) -> Path:
 
 
 def _missing(shown: str, kind: str, name: str, folder: Path) -> ValueError:
-    there = sorted(item.name for item in folder.iterdir() if item.is_file()) if folder.is_dir() else []
-    near = nearest(Path(name).name, there, "put it there") if there else "that folder does not exist or is empty"
+    existing = sorted(item.name for item in folder.iterdir() if item.is_file()) if folder.is_dir() else []
+    near = nearest(Path(name).name, existing, "put it there") if existing else "that folder does not exist or is empty"
     return ValueError(f"{shown}: its {kind} {name} is missing in {folder}; {near}")
 
 

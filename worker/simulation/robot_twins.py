@@ -141,12 +141,12 @@ class Twins:
     def geoms(self) -> Pairs:
         """The geoms that can touch or that tendons wrap: Newton leaves out those that are only seen."""
         model, built = self.file, self.built
-        file_names, there = names_of(model, "geom", effective_geoms(model)), effective_geoms(built)
+        file_names, theirs = names_of(model, "geom", effective_geoms(model)), effective_geoms(built)
         pairs: Pairs = {}
         for body, twin in self.bodies.items():
             names = {
                 geom: plain(short(self.builder.shape_label[self._shapes[geom]]))
-                for geom in there
+                for geom in theirs
                 if built.geom_bodyid[geom] == twin
             }
             pairs |= paired({geom: name for geom, name in file_names.items() if model.geom_bodyid[geom] == body}, names)
@@ -160,9 +160,9 @@ class Twins:
         shapes = [shape for shape, flags in enumerate(builder.shape_flags) if flags & newton.ShapeFlags.SITE]
         found: dict[int, int | None] = {}
         for body, twin in self.bodies.items():
-            there = [shape for shape in shapes if builder.shape_body[shape] == self.body_indices[twin]]
+            theirs = [shape for shape in shapes if builder.shape_body[shape] == self.body_indices[twin]]
             mine = {site: name for site, name in file_names.items() if model.site_bodyid[site] == body}
-            pairs = paired(mine, {shape: plain(short(builder.shape_label[shape])) for shape in there})
+            pairs = paired(mine, {shape: plain(short(builder.shape_label[shape])) for shape in theirs})
             found |= {site: pairs.get(site) for site in mine}
         return found
 
@@ -275,12 +275,12 @@ ENDS: dict[str, Callable[[Any, int], Ends]] = {"tendon": tendon_ends, "equality"
 def _matched(*keys: tuple[Iterable[Hashable], Iterable[Hashable]]) -> Pairs:
     """Pair the elements whose first keys are equal, then of the rest those whose next ones are; equal keys in their order."""
     pairs: Pairs = {}
-    for there, here in keys:
+    for theirs, here in keys:
         taken, rest = set(pairs.values()), defaultdict(list)
         for twin, key in enumerate(here):
             if twin not in taken:
                 rest[key].append(twin)
-        for index, key in enumerate(there):
+        for index, key in enumerate(theirs):
             if index not in pairs and rest[key]:
                 pairs[index] = rest[key].pop(0)
     return pairs

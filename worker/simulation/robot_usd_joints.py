@@ -64,8 +64,8 @@ def faults(both: UsdStage) -> Iterator[str]:
             child, count = builder.body_label[builder.joint_child[index]], sum(builder.joint_dof_dim[index])
             if ends and child not in ends:
                 yield f"joint {path} moves {child}, in the file one of {some([*ends])}"
-            if count != (there := _freedoms(prim)):
-                yield f"joint {path} has {count} degrees of freedom, in the file {there}"
+            if count != (other := _freedoms(prim)):
+                yield f"joint {path} has {count} degrees of freedom, in the file {other}"
 
 
 def compare(both: UsdStage) -> None:
@@ -145,9 +145,9 @@ def _compare_frames(both: UsdStage, prim: Any, index: int) -> bool:
             continue  # on the world's side tools write many things: the place of the body is compared
         target = both.stage.GetPrimAtPath(relation.GetTargets()[0])
         frame = both.pose(target, position.Get(), rotation.Get())
-        there = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
-        if not same_pose(wp.transform(*frames[index]), there):
-            both.correct(element, f"physics:localPos{end} and localRot{end}", frames, index, there)
+        other = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
+        if not same_pose(wp.transform(*frames[index]), other):
+            both.correct(element, f"physics:localPos{end} and localRot{end}", frames, index, other)
     return reversed_
 
 
@@ -155,8 +155,8 @@ def _compare_axes(both: UsdStage, prim: Any, index: int, reversed_: bool) -> Non
     builder, element = both.builder, f"joint {prim.GetPath()}"
     axis = prim.GetAttribute("physics:axis").Get() if prim.HasAttribute("physics:axis") else None
     if sum(builder.joint_dof_dim[index]) == 1 and axis:
-        there = wp.vec3(*((-1.0 if reversed_ else 1.0) if axis == letter else 0.0 for letter in "XYZ"))
-        both.correct(element, "physics:axis", builder.joint_axis, builder.joint_qd_start[index], there)
+        other = wp.vec3(*((-1.0 if reversed_ else 1.0) if axis == letter else 0.0 for letter in "XYZ"))
+        both.correct(element, "physics:axis", builder.joint_axis, builder.joint_qd_start[index], other)
     elif sum(builder.joint_dof_dim[index]) > 1 and reversed_:
         moved = builder.body_label[builder.joint_child[index]]
         both.differ(element, "the body that it moves", moved, "the other one")
@@ -200,20 +200,20 @@ def _compare_limits(both: UsdStage, prim: Any, dof: int, freedom: str) -> None:
     for name, values in zip(names, (both.builder.joint_limit_lower, both.builder.joint_limit_upper), strict=True):
         limit = authored(prim, prefix + name)
         if limit is not None and not shift:
-            there = float(limit) * (DEGREE if freedom in ANGULAR else 1.0)
-            both.correct(f"joint {prim.GetPath()}", prefix + name, values, dof, there)
+            other = float(limit) * (DEGREE if freedom in ANGULAR else 1.0)
+            both.correct(f"joint {prim.GetPath()}", prefix + name, values, dof, other)
 
 
 def _compare_numbers(both: UsdStage, prim: Any, dof: int, freedom: str) -> None:
     element, angle = f"joint {prim.GetPath()}", DEGREE if freedom in ANGULAR else 1.0
     for field, (word, *names) in NUMBERS.items():
-        there = authored(prim, *names)
-        if there is not None:
-            both.correct(element, word, getattr(both.builder, field), dof, float(there))
+        other = authored(prim, *names)
+        if other is not None:
+            both.correct(element, word, getattr(both.builder, field), dof, float(other))
     degrees, damping = authored(prim, "newton:damping"), authored(prim, "mjc:damping")
     if degrees is not None or damping is not None:
-        there = float(degrees) / angle if degrees is not None else float(np.ravel(damping)[0])
-        both.correct(element, "damping", both.builder.joint_damping, dof, there)
+        other = float(degrees) / angle if degrees is not None else float(np.ravel(damping)[0])
+        both.correct(element, "damping", both.builder.joint_damping, dof, other)
 
 
 def _compare_drive(both: UsdStage, prim: Any, dof: int, freedom: str, actuator: int | None) -> None:
@@ -231,9 +231,9 @@ def _compare_drive(both: UsdStage, prim: Any, dof: int, freedom: str, actuator: 
     if drive.GetTypeAttr().Get() != "force":
         both.differ(element, "type", "force", drive.GetTypeAttr().Get())
     bias = actuator_value(builder, "actuator_biasprm", actuator)
-    for word, built, there in (("stiffness", -bias[1], stiffness), ("damping", -bias[2], damping)):
-        if not same(built, there):
-            both.differ(element, word, built, there)
+    for word, built, other in (("stiffness", -bias[1], stiffness), ("damping", -bias[2], damping)):
+        if not same(built, other):
+            both.differ(element, word, built, other)
     limit = drive.GetMaxForceAttr().Get()
     if limit is not None and math.isfinite(limit):
         limit = min(float(limit), builder.joint_effort_limit[dof])  # the joint may have a smaller one of its own

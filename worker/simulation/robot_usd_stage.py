@@ -64,8 +64,8 @@ class UsdStage:
 
     def point(self, prim: Any, local: Any) -> Any:
         """A point in a prim's own coordinates, in the world [m]."""
-        there = self._poses.GetLocalToWorldTransform(prim).Transform(local)
-        return wp.transform_point(self._turned, wp.vec3(*there))
+        other = self._poses.GetLocalToWorldTransform(prim).Transform(local)
+        return wp.transform_point(self._turned, wp.vec3(*other))
 
     def pose(self, prim: Any, position: Any = (0.0, 0.0, 0.0), rotation: Any = None) -> wp.transform:
         """A frame on a prim, in the world; scales move its origin only."""
@@ -112,10 +112,10 @@ def plain(value: Any) -> Any:
 
 def same(built: Any, file: Any, within: float = 0.0) -> bool:
     """Whether two values are equal; of two infinite ones the sign counts, and Newton's greatest number is infinite."""
-    here, there = (np.ravel(plain(value)).astype(np.float64) for value in (built, file))
+    here, other = (np.ravel(plain(value)).astype(np.float64) for value in (built, file))
     here = np.where(np.abs(here) >= newton.MAXVAL, np.copysign(np.inf, here), here)
-    finite = np.abs(there[np.isfinite(there)])
-    return bool(np.allclose(here, there, rtol=0.0, atol=within or 1e-7 + RELATIVE * finite.max(initial=0.0)))
+    finite = np.abs(other[np.isfinite(other)])
+    return bool(np.allclose(here, other, rtol=0.0, atol=within or 1e-7 + RELATIVE * finite.max(initial=0.0)))
 
 
 def same_pose(built: wp.transform, file: wp.transform) -> bool:

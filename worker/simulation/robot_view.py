@@ -71,8 +71,8 @@ class RobotView:
         self._prefix = f"{name}/" if name else ""
         self.bodies = [body for body in self._mine(template.body_label) if not is_carrier(template.body_label[body])]
         if not self.bodies:
-            there = sorted({label.partition("/")[0] for label in template.body_label})
-            raise ValueError(f"the world has no robot or object {name!r}; {nearest(name, there)}")
+            existing = sorted({label.partition("/")[0] for label in template.body_label})
+            raise ValueError(f"the world has no robot or object {name!r}; {nearest(name, existing)}")
         self.body_names = [short(template.body_label[body]) for body in self.bodies]
         self._read_joints(template)
         self._read_shapes(template)

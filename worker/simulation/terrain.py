@@ -204,10 +204,10 @@ class Terrain:
             free = min(free, target.free_memory)
         most = min(free / BYTES_PER_POINT, POINT_LIMIT)
         if points > most:
-            there = "" if device is None else f" of {free / 2**30:,.1f} GiB that are free"
+            free_memory = "" if device is None else f" of {free / 2**30:,.1f} GiB that are free"
             raise ValueError(
                 f"the terrain's {self.levels} x {self.column_count} patches at {self.resolution:g} m have {points:,} heights, which "
-                f"take about {points * BYTES_PER_POINT / 2**30:,.1f} GiB{there}; use a resolution of at least "
+                f"take about {points * BYTES_PER_POINT / 2**30:,.1f} GiB{free_memory}; use a resolution of at least "
                 f"{self.resolution * (points / most) ** 0.5:.2g} m, or fewer levels and columns"
             )
 

@@ -216,8 +216,8 @@ class SoundRecords:
         if self._is_cut(data, place, size):
             return size + 1
         ends = [end for _, end in _bounds(data, place, size) if end < size]
-        begun = [each for each in (*ends, *places(data, place + 1)) if self._is_cut(data, each, size)]
-        return min(begun, default=size)
+        started = [each for each in (*ends, *places(data, place + 1)) if self._is_cut(data, each, size)]
+        return min(started, default=size)
 
     def _is_cut(self, data: mmap.mmap, place: int, size: int) -> bool:
         """Whether a record begins here that the end of the file cuts off."""

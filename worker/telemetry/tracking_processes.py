@@ -78,7 +78,7 @@ class _Service:
 
     def __init__(self, name: str, order: Mapping[str, Any]) -> None:
         self._name, self._run = name, order["run"]
-        self._heard, self._done = threading.Event(), False
+        self._received, self._done = threading.Event(), False
         self._refused: str | None = None
         self._process = start_tied(
             [sys.executable, "-P", "-m", "worker.track"],
@@ -92,7 +92,7 @@ class _Service:
 
     def check(self, deadline: float) -> None:
         """Wait for its first word. Raises UserError where it can't be used."""
-        if not self._heard.wait(max(0.0, deadline - time.monotonic())):
+        if not self._received.wait(max(0.0, deadline - time.monotonic())):
             self._say(f"warning: it is not ready after {READY_SECONDS:.0f} s; training begins")
         if self._refused is not None:
             raise UserError(f"track.{self._name}: {self._refused}")
@@ -113,12 +113,12 @@ class _Service:
         assert self._process.stdout is not None
         for line in self._process.stdout:
             words = json.loads(line)
-            if "said" in words:
-                self._say(words["said"])
+            if "message" in words:
+                self._say(words["message"])
             self._refused = words.get("refused", self._refused)
             self._done = self._done or "done" in words
-            self._heard.set()
-        self._heard.set()
+            self._received.set()
+        self._received.set()
 
     def _say(self, text: str) -> None:
         print(f"{self._name}: {text}", flush=True)

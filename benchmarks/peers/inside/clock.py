@@ -59,15 +59,15 @@ class Clock:
         mock.patch.object(OnPolicyRunner, "learn", timed_learn).start()
         mock.patch.object(Logger, "log", timed_log).start()
 
-    def _logged(self, logger: Any, said: dict[str, Any]) -> None:
+    def _logged(self, logger: Any, output: dict[str, Any]) -> None:
         self.curve.append(
             {
                 "seconds": time.perf_counter() - self._started,
                 "env_steps": (len(self.curve) + 1) * self._batch,
                 "reward": statistics.mean(logger.rewbuffer) if logger.rewbuffer else None,
                 "episode_length": statistics.mean(logger.lenbuffer) if logger.lenbuffer else None,
-                "collect_s": said["collect_time"],
-                "learn_s": said["learn_time"],
+                "collect_s": output["collect_time"],
+                "learn_s": output["learn_time"],
             }
         )
 

@@ -17,11 +17,11 @@ from clock import Clock, device_facts, versions
 
 
 def main() -> None:
-    asked: dict[str, Any] = json.loads(sys.argv[1])
-    Path(asked["logs"]).mkdir(parents=True, exist_ok=True)
-    os.chdir(asked["logs"])
+    requested: dict[str, Any] = json.loads(sys.argv[1])
+    Path(requested["logs"]).mkdir(parents=True, exist_ok=True)
+    os.chdir(requested["logs"])
     device, wait = device_facts()
-    clock = Clock(asked["began"], asked["worlds"], asked["steps"], wait)
+    clock = Clock(requested["began"], requested["worlds"], requested["steps"], wait)
     clock.install()
     import isaaclab_rl.entrypoints.backends.train_rsl_rl as training
 
@@ -35,21 +35,21 @@ def main() -> None:
     training.create_rsl_rl_runner = noted
     on = "cpu" if device == "the CPU" else "cuda:0"
     options = {
-        "--task": asked["task"],
-        "--num_envs": asked["worlds"],
-        "--max_iterations": asked["iterations"],
-        "--seed": asked["seed"],
+        "--task": requested["task"],
+        "--num_envs": requested["worlds"],
+        "--max_iterations": requested["iterations"],
+        "--seed": requested["seed"],
         "--device": on,
-        "--frontend": asked["frontend"],
+        "--frontend": requested["frontend"],
     }
     changes = {
         "physics": "newton_mjwarp",
         "agent.device": on,
-        "agent.num_steps_per_env": asked["steps"],
-        "agent.save_interval": asked["save_every"],
-        "agent.actor.hidden_dims": json.dumps(asked["hidden_sizes"]),
-        "agent.critic.hidden_dims": json.dumps(asked["hidden_sizes"]),
-        **{f"env.sim.physics.solver_cfg.{name}": value for name, value in asked["limits"].items()},
+        "agent.num_steps_per_env": requested["steps"],
+        "agent.save_interval": requested["save_every"],
+        "agent.actor.hidden_dims": json.dumps(requested["hidden_sizes"]),
+        "agent.critic.hidden_dims": json.dumps(requested["hidden_sizes"]),
+        **{f"env.sim.physics.solver_cfg.{name}": value for name, value in requested["limits"].items()},
     }
     training.run(
         [str(word) for option in options.items() for word in option] + [f"{key}={it}" for key, it in changes.items()]
@@ -58,9 +58,9 @@ def main() -> None:
     physics = config.sim.physics
     names = ("solver", "integrator", "cone", "iterations", "ls_iterations", "tolerance", "njmax", "nconmax", "impratio")
     clock.write(
-        asked["out"],
+        requested["out"],
         device=device,
-        frontend=asked["frontend"],
+        frontend=requested["frontend"],
         solver={
             "timestep": config.sim.dt,
             "decimation": config.decimation,

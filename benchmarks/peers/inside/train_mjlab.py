@@ -45,33 +45,33 @@ def probe(runner: Any, least: int = 8) -> dict[str, Any]:
 
 
 def main() -> None:
-    asked: dict[str, Any] = json.loads(sys.argv[1])
+    requested: dict[str, Any] = json.loads(sys.argv[1])
     os.environ.setdefault("WANDB_MODE", "disabled")
     import mjlab.tasks  # noqa: F401 - fills the registry
     import torch
     from mjlab.scripts.train import TrainConfig, launch_training
     from mjlab.tasks.registry import list_tasks
 
-    if asked["task"] not in list_tasks():
-        raise SystemExit(f"mjlab has no task {asked['task']}; it has {', '.join(list_tasks())}")
+    if requested["task"] not in list_tasks():
+        raise SystemExit(f"mjlab has no task {requested['task']}; it has {', '.join(list_tasks())}")
     device, wait = device_facts()
-    clock = Clock(asked["began"], asked["worlds"], asked["steps"], wait)
+    clock = Clock(requested["began"], requested["worlds"], requested["steps"], wait)
     clock.install()
-    training = TrainConfig.from_task(asked["task"])
+    training = TrainConfig.from_task(requested["task"])
     environment = training.env
     agent: Any = training.agent  # of the runner that has an actor and a critic, which the common base lacks
-    environment.scene.num_envs = asked["worlds"]
+    environment.scene.num_envs = requested["worlds"]
     physics = environment.sim.mujoco
-    for name, value in asked["limits"].items():
+    for name, value in requested["limits"].items():
         setattr(physics, name, value)
-    agent.max_iterations, agent.num_steps_per_env = asked["iterations"], asked["steps"]
-    agent.actor.hidden_dims = agent.critic.hidden_dims = tuple(asked["hidden_sizes"])
-    agent.seed, agent.save_interval = asked["seed"], asked["save_every"]
+    agent.max_iterations, agent.num_steps_per_env = requested["iterations"], requested["steps"]
+    agent.actor.hidden_dims = agent.critic.hidden_dims = tuple(requested["hidden_sizes"])
+    agent.seed, agent.save_interval = requested["seed"], requested["save_every"]
     agent.logger, agent.upload_model = "tensorboard", False
     on = [0] if torch.cuda.is_available() else None
-    launch_training(asked["task"], dataclasses.replace(training, log_root=asked["logs"], gpu_ids=on))
+    launch_training(requested["task"], dataclasses.replace(training, log_root=requested["logs"], gpu_ids=on))
     clock.write(
-        asked["out"],
+        requested["out"],
         device=device,
         solver={"timestep": physics.timestep, "decimation": environment.decimation, **dataclasses.asdict(physics)},
         network={"actor": agent.actor.hidden_dims, "critic": agent.critic.hidden_dims},

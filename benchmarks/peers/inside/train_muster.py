@@ -21,11 +21,11 @@ SHARED = ("env_steps", "reward", "episode_length")
 
 
 def main() -> None:
-    asked: dict[str, Any] = json.loads(sys.argv[1])
+    requested: dict[str, Any] = json.loads(sys.argv[1])
     device, wait = device_facts()
-    loop = build_loop(asked, Path(asked["logs"]), algorithm=asked["algorithm"])
+    loop = build_loop(requested, Path(requested["logs"]), algorithm=requested["algorithm"])
     wait()
-    startup = time.time() - asked["began"]
+    startup = time.time() - requested["began"]
     loop.train()
     run = loop.job.run
     loop.close()
@@ -46,13 +46,13 @@ def main() -> None:
         "curve": curve,
         "checkpoints": checkpoints,
         "device": device,
-        "algorithm": asked["algorithm"],
+        "algorithm": requested["algorithm"],
         "solver": {"substeps": loop.task.config.substeps, **loop.task.solver_options},
         "steps": loop.algorithm.steps,
         "settings": dataclasses.asdict(loop.training.settings),
         "versions": versions("muster", "newton", "mujoco-warp", "warp-lang", "torch"),
     }
-    Path(asked["out"]).write_text(json.dumps(found, default=str))
+    Path(requested["out"]).write_text(json.dumps(found, default=str))
 
 
 if __name__ == "__main__":

@@ -16,26 +16,26 @@ from worker.learning.setup import build_task
 
 
 def main() -> None:
-    asked: dict[str, Any] = json.loads(sys.argv[1])
+    requested: dict[str, Any] = json.loads(sys.argv[1])
     device, wait = device_facts()
-    clock = Clock(asked["began"], asked["worlds"], asked["steps"], wait)
+    clock = Clock(requested["began"], requested["worlds"], requested["steps"], wait)
     clock.install()
     with tempfile.TemporaryDirectory() as store:
         # one world gives the job's configuration; the runner builds its own worlds for training
-        loop = build_loop({**asked, "worlds": 1}, Path(store))
-        share = type(loop.share).of(0, 1, asked["worlds"])
-        task = build_task(type(loop.task), loop.config, share, loop.gang, asked["seed"])
+        loop = build_loop({**requested, "worlds": 1}, Path(store))
+        share = type(loop.share).of(0, 1, requested["worlds"])
+        task = build_task(type(loop.task), loop.config, share, loop.gang, requested["seed"])
         settings = loop.training.settings
         loop.close()
-    logs = Path(asked["logs"])
+    logs = Path(requested["logs"])
     logs.mkdir(parents=True, exist_ok=True)
-    runner = stock_runner(task, settings, str(logs), save_interval=asked["save_every"])
-    runner.learn(asked["iterations"], init_at_random_ep_len=True)
+    runner = stock_runner(task, settings, str(logs), save_interval=requested["save_every"])
+    runner.learn(requested["iterations"], init_at_random_ep_len=True)
     clock.write(
-        asked["out"],
+        requested["out"],
         device=device,
         solver={"substeps": task.config.substeps, **task.solver_options},
-        network={"hidden_sizes": asked["hidden_sizes"]},
+        network={"hidden_sizes": requested["hidden_sizes"]},
         versions=versions("muster", "newton", "mujoco-warp", "warp-lang", "rsl-rl-lib", "torch"),
     )
 

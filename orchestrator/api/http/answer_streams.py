@@ -61,7 +61,7 @@ def pause(least: float) -> float:
     return max(least, _SHARE * _open.total())
 
 
-async def looked(look: Callable[[], T], calls: StoreCalls | None) -> T:
+async def polled(look: Callable[[], T], calls: StoreCalls | None) -> T:
     """The result of ``look``, from a thread that serves these answers alone; one of ``calls`` where it reads the store.
 
     Raises what it raises, StoreSilent.
@@ -70,9 +70,9 @@ async def looked(look: Callable[[], T], calls: StoreCalls | None) -> T:
     return await asyncio.wrap_future(future)
 
 
-async def looked_patiently(look: Callable[[], T], calls: StoreCalls | None, seconds: float) -> AsyncIterator[T | None]:
+async def polled_patiently(look: Callable[[], T], calls: StoreCalls | None, seconds: float) -> AsyncIterator[T | None]:
     """:func:`looked`, and before it None whenever so many seconds have passed: the store may hang."""
-    task = asyncio.ensure_future(looked(look, calls))
+    task = asyncio.ensure_future(polled(look, calls))
     try:
         while not (await asyncio.wait({task}, timeout=seconds))[0]:
             yield None

@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable, Collection, Iterable, Itera
 from dataclasses import dataclass, field
 from typing import Any
 
-from orchestrator.api.http.answer_streams import MEMORY_PIECE, looked, pause
+from orchestrator.api.http.answer_streams import MEMORY_PIECE, pause, polled
 from orchestrator.api.logs import eventstream
 from orchestrator.api.logs.filter import Matcher
 from orchestrator.api.logs.log_events import LogEvent, is_event, milliseconds
@@ -245,9 +245,9 @@ async def messages(
 
 async def _polled(tail: LiveTail) -> tuple[list[LogEvent], bool]:
     """The new events, from memory where that has them, else from the files; and whether some of them were left out."""
-    found = await looked(tail.poll_memory, None)
+    found = await polled(tail.poll_memory, None)
     if found is None:
-        found = await looked(tail.poll, tail.calls)
+        found = await polled(tail.poll, tail.calls)
     if (count := len(found)) > _MOST_PENDING:  # the newest is always among them
         return [found[(place + 1) * count // _MOST_PENDING - 1] for place in range(_MOST_PENDING)], True
     return found, False

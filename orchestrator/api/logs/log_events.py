@@ -70,7 +70,7 @@ class LogFile:
         self.path, self.stream = path, stream
         self.source = int.from_bytes(hashlib.sha256(stream.encode()).digest()) % 10**24
         self._lock = threading.Lock()
-        self._begun, self._barren = 0, 0
+        self._started, self._barren = 0, 0
         self._forget()
 
     def look(self) -> LogSnapshot:
@@ -91,7 +91,7 @@ class LogFile:
                     segments = segments_of(self.path)
             self._drop_deleted(segments)
             return LogSnapshot(
-                self, segments, self._marks, len(self._marks), self._end, self._top, self._gap, self._begun
+                self, segments, self._marks, len(self._marks), self._end, self._top, self._gap, self._started
             )
 
     def _forget(self) -> None:
@@ -103,7 +103,7 @@ class LogFile:
         self._end = 0
         self._top = 0
         self._cursor = LogCursor()
-        self._begun += 1
+        self._started += 1
 
     def _extend(self, segments: Sequence[LogSegment]) -> bool:
         """Take up the next blocks; False where no whole line is left."""
@@ -163,7 +163,7 @@ class LogSnapshot:
     top: int
     """The newest time [ms]; 0 where there is no event."""
     gap: Gap | None
-    begun: int
+    started: int
     """Number of times that the log began: it differs from the look before where the log was truncated or replaced."""
 
     def replaced(self) -> LogEvent:

@@ -243,7 +243,7 @@ def _progress(controller: Controller, actor: Actor, trainings: Sequence[_Trainin
             owners = {name: owner_of(session, run) for name, run in runs.items()}
         hidden = {name for name, owner in owners.items() if owner is None or not actor.may_see(owner)}
     shown = [each for each in trainings if each.job.run not in hidden]
-    known = {each.job.id: _told(controller, each, read[each.job.id]) for each in shown}
+    known = {each.job.id: _reported(controller, each, read[each.job.id]) for each in shown}
     return {job: progress for job, progress in known.items() if progress is not None}
 
 
@@ -256,7 +256,7 @@ def _read(
     return read, {name: facts_of(store.run(name)) for name in names}
 
 
-def _told(controller: Controller, training: _Training, curve: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def _reported(controller: Controller, training: _Training, curve: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """Progress of a training: the last report of its main node, and its curve; None before its first iteration."""
     job = training.job
     live = controller.bus.progress(job.id, job.attempts[-1].number, training.main) or {}

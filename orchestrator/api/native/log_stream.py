@@ -8,7 +8,7 @@ import threading
 import time
 from collections.abc import AsyncIterator, Sequence
 
-from orchestrator.api.http.answer_streams import MEMORY_PIECE, looked, looked_patiently, pause
+from orchestrator.api.http.answer_streams import MEMORY_PIECE, pause, polled, polled_patiently
 from orchestrator.control.log_hub import LogHub, Waker
 from orchestrator.control.log_tail import JobLogs
 from orchestrator.control.store_calls import StoreCalls, StoreSilent
@@ -44,7 +44,7 @@ async def stored(view: LogView, calls: StoreCalls) -> AsyncIterator[str]:
     """All that is there, many lines at a time: each piece costs a hand-over between threads."""
     pieces = map(_json_lines, view.batches())  # on the thread: many may begin at once
     try:
-        while (lines := await asyncio.wait_for(looked(lambda: next(pieces, None), calls), _PATIENCE)) is not None:
+        while (lines := await asyncio.wait_for(polled(lambda: next(pieces, None), calls), _PATIENCE)) is not None:
             yield lines
     except TimeoutError:
         yield _trouble(OSError(f"the store has not answered for {_PATIENCE:.0f} s"))
@@ -73,7 +73,7 @@ async def _lines(
         lines = _json_lines(found or ())
         if found is None:
             try:
-                async for read in looked_patiently(lambda: _json_lines(view.poll()), calls, _HEARTBEAT):
+                async for read in polled_patiently(lambda: _json_lines(view.poll()), calls, _HEARTBEAT):
                     if read is None:
                         yield "\n"
                     lines = read or ""

@@ -180,7 +180,7 @@ def _engines(controller: Controller, capacities: Mapping[str, Capacity]) -> list
             "queue": own[name],
             "elastic": engine.is_elastic([name]),
             "queuesByItself": isinstance(capacities.get(name), Queued),
-            "toldAt": health.told_at,
+            "toldAt": health.reported_at,
             "problem": health.problem,
             "failing": health.failing,
             "retry": health.retry,

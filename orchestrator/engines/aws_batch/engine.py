@@ -45,7 +45,7 @@ _MEMORY = 32 * 1024
 """MiB a vCPU at most, of all of EC2's instance types."""
 _DESCRIBED = 100
 """Jobs and nodes that AWS describes in one request, at most."""
-_AWAY = 15.0
+_UNREACHABLE = 15.0
 """Seconds for which an AWS that did not answer is left alone."""
 
 
@@ -119,16 +119,16 @@ class AwsBatchEngine:
 
     def stop(self, handle: Handle, grace: float) -> None:
         """AWS's own grace is 30 s, whatever ``grace`` says."""
-        watched, is_asked = self._watched(handle), False
+        watched, is_requested = self._watched(handle), False
 
         def step() -> str:
-            nonlocal is_asked
+            nonlocal is_requested
             problem: EngineError | None = None
             try:
-                if not is_asked:
+                if not is_requested:
                     with answered():
                         self._batch.terminate_job(jobId=handle.facts["aws"], reason="ended by Muster")
-                    is_asked = True
+                    is_requested = True
             except EngineError as error:
                 problem = error
             self._update([watched])
@@ -211,7 +211,7 @@ class AwsBatchEngine:
                 for job in self._batch.describe_jobs(jobs=ids[start : start + _DESCRIBED])["jobs"]:
                     described[job["jobId"]] = job
         except FAILURES as error:
-            trouble, pause = f"AWS Batch does not answer: {words_of(error)}", _AWAY
+            trouble, pause = f"AWS Batch does not answer: {words_of(error)}", _UNREACHABLE
         for each in gangs:
             each.update(described, trouble, pause)
 

@@ -114,7 +114,7 @@ class DockerEngine:
         self._copying = threading.Lock()
         """Held where a copy is looked for and begun: a log has one writer."""
         self._ended: dict[str, dict[int, NodeStatus]] = {}
-        self._away = False
+        self._unreachable = False
 
     def capacity(self) -> Hosts:
         return Hosts([self._host])
@@ -139,14 +139,14 @@ class DockerEngine:
             with answered():
                 listed = self._listed()
         except NotYet as error:
-            if not self._away:  # said once, not at every look
+            if not self._unreachable:  # said once, not at every look
                 log.warning("engine docker: %s", error)
-            self._away = True
+            self._unreachable = True
             return [
                 [NodeStatus(NodePhase.UNREACHABLE, address, str(error)) for address in handle.facts["addresses"]]
                 for handle in handles
             ]
-        self._away = False
+        self._unreachable = False
         return one_by_one(lambda handle: self._observe(handle, listed.get(handle.gang, {})), handles)
 
     def stop(self, handle: Handle, grace: float) -> None:

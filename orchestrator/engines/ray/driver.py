@@ -70,9 +70,9 @@ class Driver:
             if not gang.is_over or gang.phase == "stopping":
                 self.idle_since = time.monotonic()
             elif self._leaves or idle > 4 * _LINGER:  # nobody asks: the controller has been gone for long
-                gang.tell()
+                gang.publish()
                 gang.clear()
-            gang.tell()
+            gang.publish()
 
     def _step(self, gang: DrivenGang) -> None:
         if gang.phase == "joining":
@@ -160,7 +160,7 @@ class Driver:
             return
         with contextlib.suppress(OSError):  # it was stopped meanwhile
             self.gang = DrivenGang(json.loads(self.folder.plan(name).read_bytes()), self.folder)
-            self.gang.tell()
+            self.gang.publish()
 
     def _read(self, seconds: float) -> None:
         if select.select([self.commands], [], [], seconds)[0]:
@@ -207,7 +207,7 @@ def main(argv: list[str]) -> int:
 
     def give_up(why: str) -> None:
         gang.fail(why)
-        gang.tell()
+        gang.publish()
         os._exit(1)
 
     late = f"the Ray cluster at {head} let nobody join for {_JOINING:.0f} s"

@@ -96,7 +96,7 @@ class RayEngine:
         self._lock = threading.Lock()
         self._grown: dict[str, Sequence[str]] = {}
         """Hosts of the gangs for which machines were to be added; guarded by the lock, since stops forget gangs."""
-        self._clear_away()
+        self._clear()
 
     # -- the cluster --------------------------------------------------------------------------------------------------
 
@@ -200,10 +200,10 @@ class RayEngine:
 
     def stop(self, handle: Handle, grace: float) -> None:
         gang, folder = handle.gang, Folder.of(self.home, handle.gang)
-        asked, patience = 0.0, time.monotonic() + grace + 2 * LEASE
+        last_request, patience = 0.0, time.monotonic() + grace + 2 * LEASE
 
         def step() -> str:
-            nonlocal asked
+            nonlocal last_request
             state = read_json(folder.state(gang))
             phase = state["phase"] if state is not None else ""
             if phase == "stopped" or (state is None and not folder.plan(gang).exists()):
@@ -214,8 +214,8 @@ class RayEngine:
             if now > patience and state is not None:  # frozen; its actors have missed it for long enough
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(state["driver"], signal.SIGKILL)
-            if now - asked > 2.0:
-                asked = now
+            if now - last_request > 2.0:
+                last_request = now
                 if not folder.send({"do": "stop", "gang": gang, "grace": grace}):
                     self._outwait(folder, gang)
             return f"its driver reports {phase}" if phase else "its driver has reported nothing yet"
@@ -288,7 +288,7 @@ class RayEngine:
             if path.name != job:
                 Folder(path).send({"do": "leave"})
 
-    def _clear_away(self) -> None:
+    def _clear(self) -> None:
         """Remove the folders of jobs that have long been over."""
         for path in (self.home / "ray").glob("*"):
             if time.time() - path.stat().st_mtime > _KEPT and not Folder(path).send():

@@ -44,7 +44,7 @@ class DrivenGang:
         """How often it was placed."""
         self.deadline = self._next_beat = 0.0
         """When a stop has to be done with, and when the next signs of life are due [monotonic s]."""
-        self._told: dict[str, Any] = {}
+        self._reported: dict[str, Any] = {}
         """The state file's content."""
         self._unplace()
 
@@ -52,20 +52,20 @@ class DrivenGang:
         fresh = {"running": True, "started": False, "address": "", "gpus": "", "code": None, "detail": ""}
         self.nodes: list[dict[str, Any]] = [{**fresh, "ray_node": node["pin"] or ""} for node in self.plan["nodes"]]
         self.actors: list[Any] = []
-        self.asked: dict[Any, tuple[str, int]] = {}
+        self.calls: dict[Any, tuple[str, int]] = {}
         """Calls of actors that are not answered: a kind and a node's index."""
-        self.heard = [time.monotonic()] * len(self.nodes)
+        self.last_replies = [time.monotonic()] * len(self.nodes)
         self.leaving: set[int] = set()
         """Indices of nodes that were told to leave."""
         self.broken: dict[int, float] = {}
         """Since when the connection to an actor is broken."""
 
-    def tell(self) -> None:
+    def publish(self) -> None:
         """Write the state file where something changed."""
         state = {"gang": self.name, "driver": os.getpid(), "phase": self.phase, "why": self.why, "nodes": self.nodes}
-        if state != self._told:
+        if state != self._reported:
             write_json(self.folder.state(self.name), state)
-            self._told = json.loads(json.dumps(state))
+            self._reported = json.loads(json.dumps(state))
 
     @property
     def lost(self) -> set[int]:
@@ -79,7 +79,7 @@ class DrivenGang:
     @property
     def is_stopping(self) -> bool:
         """Whether a node that was asked to end, or that is to say how it ended, has not answered yet."""
-        return any(kind in ("stop", "wait") for kind, _ in self.asked.values())
+        return any(kind in ("stop", "wait") for kind, _ in self.calls.values())
 
     def end(self, index: int, code: int | None, detail: str, cause: Cause | None = None) -> None:
         """``cause``: where it is another one than the exit code says."""
@@ -103,7 +103,7 @@ class DrivenGang:
     def _ask(self, kind: str, index: int, *arguments: Any) -> Any:
         """Call a method of a node's actor; :meth:`listen` takes the answer."""
         reference = getattr(self.actors[index], kind).remote(*arguments)
-        self.asked[reference] = (kind, index)
+        self.calls[reference] = (kind, index)
         return reference
 
     def place(self, group: Any) -> None:
@@ -124,7 +124,7 @@ class DrivenGang:
         about = self.plan["directory"], contract.store, contract.run, contract.epoch, self.name
         for index in range(len(self.actors)):
             self._ask("facts", index, __version__, *about)
-        self.heard = [time.monotonic()] * len(self.nodes)
+        self.last_replies = [time.monotonic()] * len(self.nodes)
         self.phase, self.why = "starting", "starting an actor on each node"
 
     def start(self, addresses: list[str]) -> None:
@@ -135,7 +135,7 @@ class DrivenGang:
             self.fail(f"no free port from {first_port(self.name)} on {addresses[main]}")
             return
         self.phase, self.why = "running", ""
-        self.tell()  # before it starts anything: the engine starts a gang again if it finds an earlier phase
+        self.publish()  # before it starts anything: the engine starts a gang again if it finds an earlier phase
         meeting = {"master_address": addresses[main], "master_port": port}
         for index in sorted(range(len(self.nodes)), key=lambda index: index != main):
             node = self.plan["nodes"][index]
@@ -150,7 +150,7 @@ class DrivenGang:
         """Ask every node that can be reached to end; :meth:`listen` notes when they have."""
         self.phase, self.why, self.deadline = "stopping", "", time.monotonic() + grace + _ENDING
         lost = self.lost  # nobody is there to answer
-        self.asked = {reference: call for reference, call in self.asked.items() if call[1] not in lost}
+        self.calls = {reference: call for reference, call in self.calls.items() if call[1] not in lost}
         for index in range(len(self.actors)):
             if index not in lost:
                 self._ask("stop", index, grace)
@@ -164,15 +164,15 @@ class DrivenGang:
 
     def listen(self, seconds: float) -> None:
         """Take what actors answer within that time, and what became of those that do not."""
-        if not self.asked:
+        if not self.calls:
             time.sleep(seconds)
         else:
-            ray.wait(list(self.asked), num_returns=1, timeout=seconds)
-            for reference in ray.wait(list(self.asked), num_returns=len(self.asked), timeout=0)[0]:
-                kind, index = self.asked.pop(reference)
+            ray.wait(list(self.calls), num_returns=1, timeout=seconds)
+            for reference in ray.wait(list(self.calls), num_returns=len(self.calls), timeout=0)[0]:
+                kind, index = self.calls.pop(reference)
                 try:
                     self._take(kind, index, ray.get(reference))
-                    self.heard[index] = time.monotonic()
+                    self.last_replies[index] = time.monotonic()
                     self.broken.pop(index, None)
                 except ray.exceptions.ActorUnavailableError:  # a connection broke: the machine's end, or the network's
                     self.broken.setdefault(index, time.monotonic())
@@ -216,14 +216,14 @@ class DrivenGang:
         if now < self._next_beat or not self.actors:
             return
         self._next_beat = now + _BEAT
-        waiting = {index for kind, index in self.asked.values() if kind == "beat"}
+        waiting = {index for kind, index in self.calls.values() if kind == "beat"}
         patience = _STARTING if self.phase == "starting" else LEASE
         for index, node in enumerate(self.nodes):
             if index not in waiting:
                 self._ask("beat", index)
                 if not node["running"]:
-                    self.heard[index] = now
-            elif now - self.heard[index] > patience:
+                    self.last_replies[index] = now
+            elif now - self.last_replies[index] > patience:
                 node["silent"] = True
                 self.end(index, None, f"its Ray actor has not answered for {patience:.0f} s")
 
@@ -238,7 +238,7 @@ class DrivenGang:
             early = ("stopped before it was started", Cause.STOPPED)
             self.end(index, None, *(("", None) if node["started"] else early))
         self._kill_actors()
-        self.actors, self.asked, self.phase = [], {}, "stopped"
+        self.actors, self.calls, self.phase = [], {}, "stopped"
         self.folder.plan(self.name).unlink(missing_ok=True)
 
     def _kill_actors(self) -> None:

@@ -30,7 +30,7 @@ class Node:
         lease: Seconds without :meth:`beat` after which the node is ended: its driver is gone, or cut off.
         """
         self.marks, self.lease = [f"{name}={value}" for name, value in marks.items()], lease
-        self.heard = time.monotonic()
+        self.last_call = time.monotonic()
         self._order: tuple[list[str], dict[str, str], str | None] | None = None
         self._started, self._ended, self._ordered = threading.Event(), threading.Event(), threading.Event()
         self._process: subprocess.Popen[bytes] | None = None
@@ -112,7 +112,7 @@ class Node:
 
     def beat(self) -> None:
         """The driver is there."""
-        self.heard = time.monotonic()
+        self.last_call = time.monotonic()
 
     def leave(self) -> None:
         """Ask the supervisor to leave (SIGTERM): it saves, within its grace time."""
@@ -172,7 +172,7 @@ class Node:
         os._exit(1)
 
     def _abandoned(self) -> bool:
-        return time.monotonic() - self.heard > self.lease
+        return time.monotonic() - self.last_call > self.lease
 
     def _end(self) -> str:
         """SIGKILL to all of the node; what it does not end, or nothing."""

@@ -16,11 +16,11 @@ from orchestrator.engines.toolkit.environment import inherited
 
 _LIMIT = 30.0
 """Seconds after which a command has failed: Slurm's own patience with a controller that is away is a minute and more."""
-_AWAY = re.compile(
+_UNREACHABLE = re.compile(
     r"(?i)unable to contact|connection (refused|timed out)|socket timed out|not responding|zero bytes|try again"
 )
 _UNCONFIGURED = re.compile("Could not establish a configuration source|resolve_ctls_from_dns_srv")
-_AWAY_STATES = frozenset(
+_UNAVAILABLE_STATES = frozenset(
     {"DOWN", "DRAIN", "DRAINED", "DRAINING", "ERROR", "FAIL", "FAILING", "INVAL", "INVALID_REG"}
     | {"MAINT", "MAINTENANCE", "NOT_RESPONDING", "UNKNOWN"}
 )
@@ -70,7 +70,7 @@ def call(*command: str, text: str | None = None) -> str:
         return done.stdout
     lines = [re.sub(r"^\w+: (error|fatal): ", "", line).strip() for line in done.stderr.splitlines() if line.strip()]
     why = "; ".join(dict.fromkeys(lines)) or f"exit code {done.returncode}"
-    if _AWAY.search(why):
+    if _UNREACHABLE.search(why):
         raise SlurmUnreachable(f"slurmctld does not answer ({why}); see `scontrol ping`")
     if _UNCONFIGURED.search(why):
         raise EngineError(
@@ -111,8 +111,8 @@ def list_hosts() -> list[Host]:
         gpus = sum(int(count) for count in re.findall(r"(?:^|,)gpu:(?:[^:,()]+:)?(\d+)", fields.get("Gres", "")))
         cpus = float(fields.get("CPUEfctv") or fields.get("CPUTot", "1"))
         ids = tuple(str(number) for number in range(gpus))
-        memory, away = int(fields.get("RealMemory", "0")), bool(state & _AWAY_STATES)
-        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, memory, single=True, unavailable=away))
+        memory, unavailable = int(fields.get("RealMemory", "0")), bool(state & _UNAVAILABLE_STATES)
+        hosts.append(Host(f"slurm/{fields['NodeName']}", cpus, ids, memory, single=True, unavailable=unavailable))
     return hosts
 
 

@@ -134,11 +134,11 @@ def await_node(rig: Rig, handle: Handle, index: int, phase: NodePhase) -> NodeSt
     """Wait until the node is in that phase."""
     status: GangStatus = ()
 
-    def is_there() -> bool:
+    def exists() -> bool:
         nonlocal status
         status = status_of(rig.engine, handle)
         assert len(status) == handle.nodes, f"{len(status)} nodes of {handle.nodes}"
         return status[index].phase is phase
 
-    assert wait_until(is_there, LIMIT), f"node {index} is not {phase} within {LIMIT:g} s: {status}"
+    assert wait_until(exists, LIMIT), f"node {index} is not {phase} within {LIMIT:g} s: {status}"
     return status[index]

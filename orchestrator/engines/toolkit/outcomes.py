@@ -35,7 +35,7 @@ def all_recorded(handle: Handle) -> dict[int, Outcome]:
     return {index: outcome for index in present if (outcome := recorded(handle, index)) is not None}
 
 
-def seen(handle: Handle, index: int, code: int, reason: str, at: float, asked: bool = False) -> Outcome:
+def seen(handle: Handle, index: int, code: int, reason: str, at: float, requested: bool = False) -> Outcome:
     """The outcome of a node without a supervisor, as its engine saw the end.
 
     Args:
@@ -47,7 +47,7 @@ def seen(handle: Handle, index: int, code: int, reason: str, at: float, asked: b
         asked: Whether it ended because others did.
     """
     words = reason or (f"container exited with code {code}" if code else "done")
-    return Outcome(index, handle.facts["epoch"], code, None, words, None, at, at, asked)
+    return Outcome(index, handle.facts["epoch"], code, None, words, None, at, at, requested)
 
 
 def record(handle: Handle, outcome: Outcome) -> None:

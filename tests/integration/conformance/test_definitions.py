@@ -75,7 +75,7 @@ def test_describing_shows_states_and_every_revision_by_name_number_or_arn(batch:
 
 
 def test_a_definition_comes_back_as_it_was_registered(batch: Batch) -> None:
-    wanted: dict[str, Any] = {
+    requested: dict[str, Any] = {
         "type": "multinode",
         "parameters": {"task": "Ant"},
         "schedulingPriority": 7,
@@ -98,14 +98,16 @@ def test_a_definition_comes_back_as_it_was_registered(batch: Batch) -> None:
         "tags": {"team": "robots"},
         "propagateTags": True,
     }
-    answer = batch.api.register_job_definition(jobDefinitionName="def-whole", **wanted)
+    answer = batch.api.register_job_definition(jobDefinitionName="def-whole", **requested)
     [found] = batch.api.describe_job_definitions(jobDefinitions=[answer["jobDefinitionArn"]])["jobDefinitions"]
     ranges = found["nodeProperties"]["nodeRangeProperties"]
     lists = ("command", "environment", "mountPoints", "resourceRequirements", "secrets", "ulimits", "volumes")
     empty: dict[str, list[Any]] = {key: [] for key in lists}
-    for given in wanted["nodeProperties"]["nodeRangeProperties"]:  # what AWS adds: an empty list for what was left out
-        given["container"] = {**empty, **given["container"]}
-    assert len(ranges) == 2 and {key: found[key] for key in wanted} == wanted
+    for supplied in requested["nodeProperties"][
+        "nodeRangeProperties"
+    ]:  # what AWS adds: an empty list for what was left out
+        supplied["container"] = {**empty, **supplied["container"]}
+    assert len(ranges) == 2 and {key: found[key] for key in requested} == requested
     assert (found["jobDefinitionArn"], found["revision"], found["status"]) == (answer["jobDefinitionArn"], 1, "ACTIVE")
     assert found["containerOrchestrationType"] == "ECS"
 
@@ -252,8 +254,8 @@ def test_overrides_are_what_the_job_shows_and_the_definition_stays_as_it_is(batc
     shown = batch.describe(f"{job}#1")["container"]
     assert shown["command"] == ["sh", "-c", "exit 3"]
     assert shown["environment"] == pairs({"TASK": "Ant", "SEED": "1", "MAX_ITERATIONS": "5"})
-    wanted = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "32"}]
-    assert shown["resourceRequirements"] == wanted
+    requested = [{"type": "VCPU", "value": "0.1"}, {"type": "MEMORY", "value": "32"}]
+    assert shown["resourceRequirements"] == requested
     [again] = batch.api.describe_job_definitions(jobDefinitions=[definition])["jobDefinitions"]
     kept = again["nodeProperties"]["nodeRangeProperties"][0]["container"]
     assert kept["environment"] == pairs({"TASK": "Cartpole", "SEED": "1"}) and kept["command"][2] == "true"
@@ -268,11 +270,11 @@ def test_the_aws_command_registers_describes_and_reads_errors(batch: Batch, park
     assert registered["revision"] == 1
     shown = aws(*(url, "batch", "describe-job-definitions", "--job-definition-name", "def-typed", "--status", "ACTIVE"))
     [entry] = shown["jobDefinitions"][0]["nodeProperties"]["nodeRangeProperties"]
-    given = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
-    assert {key: entry["container"][key] for key in given} == given
+    supplied = request["nodeProperties"]["nodeRangeProperties"][0]["container"]
+    assert {key: entry["container"][key] for key in supplied} == supplied
     submit = ("submit-job", "--job-name", "def-typed", "--job-queue", parked, "--job-definition", "def-typed:2")
-    said = aws(url, "batch", *submit, fails=True)
-    assert "(ClientException) when calling the SubmitJob operation: Job definition def-typed:2 does not exist" in said
+    output = aws(url, "batch", *submit, fails=True)
+    assert "(ClientException) when calling the SubmitJob operation: Job definition def-typed:2 does not exist" in output
     aws(url, "batch", "deregister-job-definition", "--job-definition", registered["jobDefinitionArn"])
     [found] = batch.api.describe_job_definitions(jobDefinitionName="def-typed")["jobDefinitions"]
     assert found["status"] == "INACTIVE"

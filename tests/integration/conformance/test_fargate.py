@@ -43,8 +43,8 @@ def test_a_fargate_job_runs_and_is_shown_with_what_has_no_effect(batch: Batch) -
     assert {key: detail["container"][key] for key in MEMBERS} == MEMBERS
     noted = batch.server.client.get(f"/api/jobs/{job}")["withoutEffect"]
     assert noted == sorted([*MEMBERS, "platformCapabilities"])
-    told = batch.server.muster("show", job, MUSTER_URL=batch.server.url).stdout
-    assert "no effect:" in told and "networkConfiguration" in told
+    reported = batch.server.muster("show", job, MUSTER_URL=batch.server.url).stdout
+    assert "no effect:" in reported and "networkConfiguration" in reported
     plain = batch.submit(batch.single("not-fargate", "true"))
     assert batch.server.client.get(f"/api/jobs/{plain}")["withoutEffect"] == []
 

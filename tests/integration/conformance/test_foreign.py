@@ -153,8 +153,8 @@ def test_a_job_of_the_api_starts_in_an_empty_directory_with_few_variables(batch:
 def test_a_job_may_keep_its_directory(batch: Batch) -> None:
     job = batch.submit(batch.single("iso-kept", "pwd; touch result", env={"MUSTER_KEEP_DIRECTORY": "1"}))
     batch.wait(job)
-    directory, said = batch.lines(job)
-    assert (Path(directory) / "result").exists() and str(Path(directory).parent) in said
+    directory, output = batch.lines(job)
+    assert (Path(directory) / "result").exists() and str(Path(directory).parent) in output
     shutil.rmtree(Path(directory).parent)
 
 
@@ -255,13 +255,13 @@ def test_ecs_properties_of_one_container_run_and_are_shown_as_they_came(batch: B
     ],
 )
 def test_a_definition_without_image_or_resources_is_refused_at_once(batch: Batch, lacking: str, message: str) -> None:
-    given = container("true", {})
-    given.pop(lacking, None)
-    given["resourceRequirements"] = [each for each in given["resourceRequirements"] if each["type"] != lacking]
+    supplied = container("true", {})
+    supplied.pop(lacking, None)
+    supplied["resourceRequirements"] = [each for each in supplied["resourceRequirements"] if each["type"] != lacking]
     with refused("Error executing request, Exception : ", message):
-        batch.register("lacking", "container", containerProperties=given)
+        batch.register("lacking", "container", containerProperties=supplied)
     with refused("Error executing request, Exception : ", message):
-        batch.multinode("lacking", "", ranges=[{"targetNodes": "0:", "container": given}])
+        batch.multinode("lacking", "", ranges=[{"targetNodes": "0:", "container": supplied}])
 
 
 def test_variables_with_names_that_no_shell_has_reach_the_job(batch: Batch) -> None:

@@ -153,7 +153,7 @@ def test_bytes_that_are_hardly_http(fuzzed: Fuzzed, data: bytes, token: str) -> 
         except ConnectionResetError:
             answer = b""
     assert not answer or answer.split()[1].startswith(b"4"), answer
-    assert "Traceback" not in (said := fuzzed.complaints()), said
+    assert "Traceback" not in (output := fuzzed.complaints()), output
 
 
 def test_afterwards_a_real_client_sees_everything_and_nothing_ran(fuzzed: Fuzzed) -> None:

@@ -58,7 +58,7 @@ def test_others_are_served_during_attacks(target: tuple[Fuzzed, Target], name: s
     count = COUNT if name in ("expansion", "hangs up") else max(COUNT, 2 * DESCRIPTORS)
     sent = CLASSES[name](victim, count, rng, meanwhile)
     assert jobs and server.log(jobs[-1])[0] == "alive"
-    said = (server.home.parent / "stderr").stat().st_size - before
-    assert said < MOST_LOG, f"the server wrote {said} bytes"
+    output = (server.home.parent / "stderr").stat().st_size - before
+    assert output < MOST_LOG, f"the server wrote {output} bytes"
     assert "Traceback" not in server.complaints()
     fuzz_report[f"client: {name}"] += sent

@@ -139,11 +139,11 @@ def test_a_token_or_a_proxy_that_is_not_safe_is_refused_at_the_start(tmp_path: P
         with pytest.raises(ServerError, match="MUSTER_TOKEN is too easy to guess: use at least 16 characters"):
             Server(tmp_path, token=token)
     assert list(tmp_path.iterdir()) == []
-    for proxy, said in (
+    for proxy, output in (
         ("proxy", "'proxy' does not appear"),
         ("127.0.0.1", "the server is reachable from other machines: first create a key"),
     ):
-        with pytest.raises(ServerError, match=f"--trust-proxy: {said}"):
+        with pytest.raises(ServerError, match=f"--trust-proxy: {output}"):
             Server(tmp_path, trusted_proxies=[proxy])
     key = HomeKeys(tmp_path).create("wall", read_only=True)
     with pytest.raises(ServerError, match=f"MUSTER_TOKEN is the key {key.access_key_id} of a client"):
@@ -178,8 +178,8 @@ def test_a_home_is_its_users_alone_and_an_open_one_is_closed(tmp_path: Path, cap
             "kernels": 0o755,  # it lies elsewhere, and may be shared
             "of somebody": 0o644,
         }
-        said = caplog.records[0].message
-        assert "since it also holds 'of somebody'" in said and "Muster's directories in it are closed" in said
+        output = caplog.records[0].message
+        assert "since it also holds 'of somebody'" in output and "Muster's directories in it are closed" in output
         database = Database.at(tmp_path / "older")
         with database.session() as session:
             session.add(JobQueue(name="x", compute_environments=[]))

@@ -182,7 +182,7 @@ def test_every_other_operation_of_aws_is_refused_by_name_with_what_to_use(batch:
         assert instead in httpx.post(f"{batch.server.url}/v1/{part.lower()}", content=b"{}").json()["message"]
     with refused("ListServiceJobs is not supported here; use SubmitJob"):
         batch.api.list_service_jobs(jobQueue="default")
-    said = aws(batch.server.url, "batch", "list-consumable-resources", fails=True)
-    assert "(ClientException) when calling the ListConsumableResources operation: ListConsumableResources" in said
+    output = aws(batch.server.url, "batch", "list-consumable-resources", fails=True)
+    assert "(ClientException) when calling the ListConsumableResources operation: ListConsumableResources" in output
     unknown = httpx.post(f"{batch.server.url}/v1/makecoffee", content=b"{}")
     assert unknown.status_code == 400 and "makecoffee is not an operation" in unknown.json()["message"]

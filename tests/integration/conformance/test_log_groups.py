@@ -84,12 +84,12 @@ def test_a_prefix_without_a_group_stays_in_the_usual_one(batch: Batch, logs: Any
 def test_nodes_of_different_groups_and_a_job_grown_by_an_override(
     batch: Batch, logs: Any, own: str, tmp_path: Path
 ) -> None:
-    said = "echo node $AWS_BATCH_JOB_NODE_INDEX"
-    last = f"until [ -e {tmp_path}/1 ] && [ -e {tmp_path}/2 ]; do sleep 0.1; done; {said}"  # its end ends the others
+    output = "echo node $AWS_BATCH_JOB_NODE_INDEX"
+    last = f"until [ -e {tmp_path}/1 ] && [ -e {tmp_path}/2 ]; do sleep 0.1; done; {output}"  # its end ends the others
 
     def part(target: str, group: str | None) -> dict[str, Any]:
         changes = {"container": {"logConfiguration": logging_to(group)} if group else {}}
-        command = f"{said}; touch {tmp_path}/$AWS_BATCH_JOB_NODE_INDEX" if group else last
+        command = f"{output}; touch {tmp_path}/$AWS_BATCH_JOB_NODE_INDEX" if group else last
         return {"targetNodes": target, "container": container(command, changes)}
 
     definition = batch.multinode("split", "", nodes=2, ranges=[part("0", None), part("1:", own)])
@@ -137,8 +137,8 @@ def test_a_live_tail_of_two_groups_names_the_group_of_each_line(
         batch.submit(batch.single("tailed-own", script, container={"logConfiguration": logging_to(own)})),
         batch.submit(batch.single("tailed-usual", script)),
     ]
-    wanted = {f"000000000000:{own}", f"000000000000:{GROUP}"}
-    wait_for(lambda: {line["logGroupIdentifier"] for line in lines if own in line["message"]} == wanted)
+    requested = {f"000000000000:{own}", f"000000000000:{GROUP}"}
+    wait_for(lambda: {line["logGroupIdentifier"] for line in lines if own in line["message"]} == requested)
     (tmp_path / "go").touch()
     for job in jobs:
         batch.server.wait(job)
@@ -261,8 +261,8 @@ def test_groups_are_listed_by_prefix_by_pattern_by_arn_and_in_pages(logs: Any, o
     brief = logs.describe_log_groups(logGroupNamePattern=f"{own}/Page3")["logGroups"]
     assert [set(group) for group in brief] == [{"logGroupName", "creationTime", "arn"}]
     assert logs.describe_log_groups(logGroupNamePattern=f"{own}/page3")["logGroups"] == []
-    wanted = [names[1], f"{ARNS}{names[2]}", f"{ARNS}{names[4]}:*", "/no/such"]
-    found = logs.describe_log_groups(logGroupIdentifiers=wanted)["logGroups"]
+    requested = [names[1], f"{ARNS}{names[2]}", f"{ARNS}{names[4]}:*", "/no/such"]
+    found = logs.describe_log_groups(logGroupIdentifiers=requested)["logGroups"]
     assert [group["logGroupName"] for group in found] == [names[1], names[2], names[4]]
     with pytest.raises(logs.exceptions.InvalidParameterException, match="nextToken"):
         logs.describe_log_groups(nextToken="x")
@@ -363,8 +363,8 @@ def test_as_covalent_runs_a_task(batch: Batch, logs: Any) -> None:
 def test_as_a_shell_script_prepares_and_reads_a_group(batch: Batch, own: str) -> None:
     """The real ``aws`` command."""
     url = batch.server.url
-    told = aws(url, "logs", "create-log-group", "--log-group-name", GROUP, fails=True)
-    assert "(ResourceAlreadyExistsException)" in told
+    reported = aws(url, "logs", "create-log-group", "--log-group-name", GROUP, fails=True)
+    assert "(ResourceAlreadyExistsException)" in reported
     aws(url, "logs", "put-retention-policy", "--log-group-name", GROUP, "--retention-in-days", "7")
     aws(url, "logs", "create-log-group", "--log-group-name", own, "--tags", "a=b")
     aws(url, "logs", "create-log-stream", "--log-group-name", own, "--log-stream-name", "s")
@@ -443,7 +443,7 @@ def test_another_account_later_is_refused_with_the_way_to_have_it(tmp_path: Path
         arn = Batch(server).api.describe_job_queues()["jobQueues"][0]["jobQueueArn"]
         assert arn == "arn:aws-cn:batch:cn-north-1:000000000000:job-queue/default"
     for options in (("--region", "us-east-1"), ("--account-id", "123456789012")):
-        said = serve(home, *options)
-        assert "account 000000000000 in cn-north-1 since its first start" in said and "another MUSTER_HOME" in said
+        output = serve(home, *options)
+        assert "account 000000000000 in cn-north-1 since its first start" in output and "another MUSTER_HOME" in output
     with Serving(home) as server, Serving(home / "other", "--region", "us-east-1"):
         assert Batch(server).api.describe_job_queues()["jobQueues"][0]["jobQueueArn"] == arn

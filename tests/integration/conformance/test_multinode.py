@@ -73,9 +73,9 @@ touch "$GATE/{NODE}"
     parent = batch.wait(job)
     [attempt] = parent["attempts"]
     address = attempt["container"]["networkInterfaces"][0]["privateIpv4Address"]
-    said = [batch.lines(f"{job}#{node}") for node in range(3)]
+    output = [batch.lines(f"{job}#{node}") for node in range(3)]
     for node in range(3):
-        variables = dict(line.split("=", 1) for line in said[node] if line.startswith("AWS_"))
+        variables = dict(line.split("=", 1) for line in output[node] if line.startswith("AWS_"))
         expected = {
             "AWS_BATCH_JOB_ID": f"{job}#{node}",
             "AWS_BATCH_JOB_ATTEMPT": "1",
@@ -91,7 +91,7 @@ touch "$GATE/{NODE}"
         assert variables.pop("AWS_EXECUTION_ENV"), "Metaflow reads it unguarded"
         assert variables == expected
     # the main node is started first, whatever its index: ticks since boot, then process ids where they are equal
-    starts = [tuple(map(int, line.split()[1:])) for lines in said for line in lines if line.startswith("started")]
+    starts = [tuple(map(int, line.split()[1:])) for lines in output for line in lines if line.startswith("started")]
     assert len(starts) == 3 and min(starts) == starts[1]
     # what is said of the parent is the main node's, which is not node 0 here
     assert (parent["status"], parent["statusReason"]) == ("FAILED", EXITED)
@@ -119,8 +119,8 @@ def test_a_parent_has_no_container_and_its_nodes_have_one(batch: Batch) -> None:
     assert main == batch.describe(f"{arn}#0"), "TorchX asks by ARN"
     assert (main["jobId"], main["jobArn"]) == (f"{job}#0", f"{arn}#0") and "nodeProperties" not in main
     assert main["nodeDetails"] == {"nodeIndex": 0, "isMainNode": True} and main["status"] == "SUCCEEDED"
-    wanted = {"image": "any", "command": ["sh", "-c", "echo here"], "environment": pairs({"A": "1"}), "exitCode": 0}
-    assert {key: main["container"][key] for key in wanted} == wanted
+    expected = {"image": "any", "command": ["sh", "-c", "echo here"], "environment": pairs({"A": "1"}), "exitCode": 0}
+    assert {key: main["container"][key] for key in expected} == expected
     for key in ("logStreamName", "taskArn", "containerInstanceArn", "networkInterfaces"):
         assert main["container"][key], key
     assert main["attempts"][0]["container"]["logStreamName"] == main["container"]["logStreamName"]
@@ -129,8 +129,8 @@ def test_a_parent_has_no_container_and_its_nodes_have_one(batch: Batch) -> None:
     assert len(streams) == 2
     assert batch.describe(arn) == batch.describe(job)
     # unknown ones are passed over, the others stay in the order in which they were asked for
-    asked = ["no-such-job", f"{job}#1", f"{job}#2", f"{job}#x", f"{job}:0", job, f"{arn}#99999999999", f"{job}#"]
-    assert [each["jobId"] for each in batch.api.describe_jobs(jobs=asked)["jobs"]] == [f"{job}#1", job]
+    requested = ["no-such-job", f"{job}#1", f"{job}#2", f"{job}#x", f"{job}:0", job, f"{arn}#99999999999", f"{job}#"]
+    assert [each["jobId"] for each in batch.api.describe_jobs(jobs=requested)["jobs"]] == [f"{job}#1", job]
     assert batch.api.describe_jobs(jobs=["no-such-job"])["jobs"] == []
     assert len(batch.api.describe_jobs(jobs=[job] * 100)["jobs"]) == 100
     with refused("at most 100"):
@@ -225,8 +225,8 @@ echo attempt $AWS_BATCH_JOB_ATTEMPT
     assert first["statusReason"] == EXITED
     for node in range(2):
         attempts = batch.describe(f"{job}#{node}")["attempts"]
-        said = [batch.stream(attempt["container"]["logStreamName"])[0] for attempt in attempts]
-        assert said == ["attempt 1", "attempt 2"]
+        output = [batch.stream(attempt["container"]["logStreamName"])[0] for attempt in attempts]
+        assert output == ["attempt 1", "attempt 2"]
     assert not processes_of_job(job)
 
 
@@ -317,8 +317,8 @@ def test_many_jobs_are_ended_at_once_each_with_its_own_result(batch: Batch, queu
     for job in (waiting[2], running):
         detail = batch.wait(job)
         assert (detail["status"], detail["statusReason"], detail["isTerminated"]) == ("FAILED", "all of it", True)
-    for jobs, said in (([], "takes at least one job"), ([running] * 51, "takes at most 50 jobs, not 51")):
-        with refused(said):
+    for jobs, output in (([], "takes at least one job"), ([running] * 51, "takes at most 50 jobs, not 51")):
+        with refused(output):
             batch.api.terminate_jobs(jobs=jobs, reason="x")
 
 
@@ -339,7 +339,7 @@ def test_a_timeout_is_sigterm_then_thirty_seconds_then_sigkill_and_no_retry(batc
     assert attempt["container"]["exitCode"] == 137 and detail["timeout"] == {"attemptDurationSeconds": 60}
     stream = {"logGroupName": "/aws/batch/job", "logStreamName": attempt["container"]["logStreamName"]}
     events = batch.logs.get_log_events(**stream, startFromHead=True)["events"]
-    [asked] = [event["timestamp"] for event in events if event["message"] == "asked to leave"]
-    assert attempt["stoppedAt"] - asked >= 29_000, "it had 30 s to leave"
+    [requested] = [event["timestamp"] for event in events if event["message"] == "asked to leave"]
+    assert attempt["stoppedAt"] - requested >= 29_000, "it had 30 s to leave"
     assert batch.describe(f"{overdue}#1")["container"]["exitCode"] == 143, "the child left when it was asked"
     assert not processes_of_job(overdue)

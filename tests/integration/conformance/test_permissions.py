@@ -199,12 +199,14 @@ def live_tail(world: World, key: str) -> httpx.Response:
     """A session until it has shown some new lines of each queue that the key may see; jobs of both print all the time."""
     headers = {"Authorization": f"Bearer {world.tokens[key]}", "X-Amz-Target": "Logs_20140328.StartLiveTail"}
     own = key.removesuffix("-reader")
-    wanted = [f"{queue} line".encode() for queue in ("robots", "lab") if own not in ("robots", "lab") or own == queue]
+    requested = [
+        f"{queue} line".encode() for queue in ("robots", "lab") if own not in ("robots", "lab") or own == queue
+    ]
     body = b""
     with world.http.stream("POST", world.url, json={"logGroupIdentifiers": [GROUP_ARN]}, headers=headers) as answer:
         for chunk in answer.iter_bytes():
             body += chunk
-            if all(body.count(line) >= 3 for line in wanted):
+            if all(body.count(line) >= 3 for line in requested):
                 break
     return httpx.Response(answer.status_code, content=body)
 

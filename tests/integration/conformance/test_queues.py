@@ -195,10 +195,10 @@ def test_every_reason_of_a_time_limit_is_taken(batch: Batch, parked: str) -> Non
             ("MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT", 86400),
         ]
     ]
-    for wanted in (limits, []):
-        batch.api.update_job_queue(jobQueue=parked, jobStateTimeLimitActions=wanted)
+    for requested in (limits, []):
+        batch.api.update_job_queue(jobQueue=parked, jobStateTimeLimitActions=requested)
         shown = batch.api.describe_job_queues(jobQueues=[parked])["jobQueues"][0]
-        assert shown["jobStateTimeLimitActions"] == wanted
+        assert shown["jobStateTimeLimitActions"] == requested
 
 
 def test_a_job_that_is_stuck_at_the_head_is_cancelled_by_its_queues_limit(server: Serving) -> None:
@@ -229,8 +229,8 @@ def test_a_scheduling_policy_can_be_replaced_but_not_taken_away(batch: Batch, pa
     arn = batch.api.create_scheduling_policy(name="q-fair", fairsharePolicy=fair, tags={"a": "1"})["arn"]
     other = batch.api.create_scheduling_policy(name="q-fair-2", fairsharePolicy={})["arn"]
     assert arn == f"{PREFIX}scheduling-policy/q-fair"
-    asked = [arn, f"{PREFIX}scheduling-policy/q-none"]
-    [shown] = batch.api.describe_scheduling_policies(arns=asked)["schedulingPolicies"]
+    requested = [arn, f"{PREFIX}scheduling-policy/q-none"]
+    [shown] = batch.api.describe_scheduling_policies(arns=requested)["schedulingPolicies"]
     assert shown == {"name": "q-fair", "arn": arn, "fairsharePolicy": fair, "tags": {"a": "1"}}
     with refused("q-fair exists already"):
         batch.api.create_scheduling_policy(name="q-fair", fairsharePolicy={})

@@ -69,8 +69,8 @@ def test_a_job_that_waits_says_what_it_needs_and_for_whom_it_waits(batch: Batch,
         "MISCONFIGURATION:COMPUTE_ENVIRONMENT_MAX_RESOURCE - compute environment q-one-cpu has at most 1 CPU; "
         "needs 1 node with 2 CPUs, 0 GPUs, 64 MiB in all"
     )
-    said = batch.reason(impossible, "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 500 CPUs, 0 GPUs, ")
-    assert "the largest host has 8 CPUs, " in said
+    output = batch.reason(impossible, "MISCONFIGURATION:JOB_RESOURCE_REQUIREMENT - each node needs 500 CPUs, 0 GPUs, ")
+    assert "the largest host has 8 CPUs, " in output
     assert f"({head[:8]})" in batch.reason(pending, "waits for the success of job ")
     page = batch.api.list_jobs(jobQueue="q-low", jobStatus="RUNNABLE")
     listed = {each["jobId"]: each["statusReason"] for each in page["jobSummaryList"]}

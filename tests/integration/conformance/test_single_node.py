@@ -26,12 +26,12 @@ def test_a_container_job_has_a_container_and_knows_nothing_of_nodes(batch: Batch
     override = {"environment": pairs({"WHO": "I"}), "resourceRequirements": [{"type": "VCPU", "value": "0.2"}]}
     job = batch.submit(definition, containerOverrides=override, parameters={"unused": "1"}, propagateTags=True)
     detail = batch.wait(job)
-    said = batch.lines(job)
-    variables = dict(line.split("=", 1) for line in said if line.startswith("AWS_"))
+    output = batch.lines(job)
+    variables = dict(line.split("=", 1) for line in output if line.startswith("AWS_"))
     assert variables.pop("AWS_EXECUTION_ENV")
     place = {"AWS_BATCH_CE_NAME": "local", "AWS_BATCH_JQ_NAME": "default"}
     assert variables == {"AWS_BATCH_JOB_ID": job, "AWS_BATCH_JOB_ATTEMPT": "1", **place}
-    assert "I works" in said
+    assert "I works" in output
     assert not {"nodeProperties", "nodeDetails", "arrayProperties"} & detail.keys()
     assert detail["container"]["exitCode"] == detail["attempts"][0]["container"]["exitCode"] == 4
     assert detail["container"]["environment"] == pairs({"WHO": "I", "WHAT": "works"})
@@ -51,8 +51,8 @@ def test_a_container_job_has_a_container_and_knows_nothing_of_nodes(batch: Batch
 
 def test_parameters_replace_references_the_submissions_before_the_definitions(batch: Batch, parked: str) -> None:
     words = ["echo", "Ref::task", "Ref::seed", "Ref::task"]
-    given = {"task": "Cartpole", "seed": "1"}
-    definition = batch.single("one-refers", "", container={"command": words}, parameters=given)
+    supplied = {"task": "Cartpole", "seed": "1"}
+    definition = batch.single("one-refers", "", container={"command": words}, parameters=supplied)
 
     def command(**request: Any) -> list[str]:
         return list(batch.describe(batch.submit(definition, queue=parked, **request))["container"]["command"])

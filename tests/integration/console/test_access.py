@@ -33,8 +33,8 @@ def test_a_program_without_a_key_still_gets_an_error_that_it_can_read(console: C
 
 def test_a_wrong_key_is_told_and_opens_nothing(console: Console) -> None:
     name = console.secrets["admin"].partition(":")[0]
-    for given in ("", "x", name, f"{name}:x", "MSTRAAAAAAAAAAAAAAAA:x", "ä\N{SNOWMAN}"):
-        answer = httpx.post(f"{console.url}/login", data={"key": given}, trust_env=False)
+    for supplied in ("", "x", name, f"{name}:x", "MSTRAAAAAAAAAAAAAAAA:x", "ä\N{SNOWMAN}"):
+        answer = httpx.post(f"{console.url}/login", data={"key": supplied}, trust_env=False)
         assert answer.status_code == 403 and "not known here" in answer.text and "set-cookie" not in answer.headers
 
 
@@ -51,8 +51,8 @@ def test_the_cookie_is_not_the_key_and_no_script_or_other_site_gets_it(console: 
     ["//evil.example", "https://evil.example/", "/\\evil.example", "\\evil", "javascript:x", "/ x", "/\tx", "//[", ""],
 )
 def test_a_login_leads_nowhere_else(console: Console, elsewhere: str) -> None:
-    given = {"next": elsewhere, "key": console.secrets["admin"]}
-    answer = httpx.post(f"{console.url}/login", data=given, trust_env=False)
+    supplied = {"next": elsewhere, "key": console.secrets["admin"]}
+    answer = httpx.post(f"{console.url}/login", data=supplied, trust_env=False)
     assert answer.status_code == 303 and answer.headers["location"] == "/"
 
 
@@ -112,8 +112,8 @@ def test_a_session_reads_the_api_and_changes_nothing_through_it(visitor: Visitor
 def test_a_change_needs_the_token_of_a_form_of_the_same_session(console: Console) -> None:
     visitor, other = console.visitor(), console.visitor("lab")
     token = visitor.page("/").form_token
-    for given in ("", "x", "ä", other.page("/").form_token):
-        answer = visitor.http.post("/jobs/stop", data={"form_token": given, "job": "x", "confirmed": "yes"})
+    for supplied in ("", "x", "ä", other.page("/").form_token):
+        answer = visitor.http.post("/jobs/stop", data={"form_token": supplied, "job": "x", "confirmed": "yes"})
         assert answer.status_code == 403 and "reload the page" in answer.text
     answer = visitor.http.post("/jobs/stop", data={"form_token": token})
     assert answer.status_code == 400 and "no job" in answer.text
@@ -241,11 +241,11 @@ def test_a_key_is_deleted_once_the_person_has_said_yes(console: Console) -> None
 def test_only_keys_with_all_queues_see_keys_and_a_read_only_one_changes_none(console: Console) -> None:
     lab, reader = console.visitor("lab"), console.visitor("reader")
     assert "limited to job queue lab" in lab.page("/keys", 403).text
-    for visitor, said in ((lab, "limited to job queue lab"), (reader, "is read-only")):
+    for visitor, output in ((lab, "limited to job queue lab"), (reader, "is read-only")):
         made = visitor.submit("/keys/create", name="mine")
         gone = visitor.submit("/keys/delete", name="admin", confirmed="yes")
         for answer in (made, gone):
-            assert answer.status_code == 403 and said in answer.json()["message"]
+            assert answer.status_code == 403 and output in answer.json()["message"]
     page = reader.page("/keys")
     assert "admin" in page.text and [each["action"] for each in page.all("form", method="post")] == ["/logout"]
     assert {key.name for key in console.keys.load().values()} >= {"admin", "lab", "reader"}

@@ -136,8 +136,8 @@ def test_curves_over_seeds_have_their_spread(visitor: Visitor, store: Store) -> 
 
 
 def test_an_unknown_metric_is_refused_with_the_nearest_one(visitor: Visitor, store: Store) -> None:
-    said = visitor.page("/compare?run=fast&metric=rewrd", 404).text
-    assert "no run here has a metric 'rewrd'; did you mean reward?" in said
+    output = visitor.page("/compare?run=fast&metric=rewrd", 404).text
+    assert "no run here has a metric 'rewrd'; did you mean reward?" in output
 
 
 def test_a_key_sees_its_own_runs_alone(console: Console, store: Store) -> None:
@@ -217,12 +217,14 @@ def test_a_form_searches_for_no_longer_text_than_the_page(console: Console) -> N
 
 
 def test_one_key_has_a_hundred_streams_at_most_and_another_one_when_one_ends(console: Console) -> None:
-    given = console.visitor("reader").http
+    supplied = console.visitor("reader").http
     limits, address = httpx.Limits(max_connections=None), "/jobs/stream"
     with ExitStack() as stack, ExitStack() as one:
-        http = stack.enter_context(httpx.Client(base_url=console.url, cookies=given.cookies, timeout=60, limits=limits))
+        http = stack.enter_context(
+            httpx.Client(base_url=console.url, cookies=supplied.cookies, timeout=60, limits=limits)
+        )
 
-        def begun() -> str:
+        def started() -> str:
             """The first event of another stream."""
             with http.stream("GET", address) as answer:
                 return "".join(islice(answer.iter_lines(), 5))
@@ -230,26 +232,26 @@ def test_one_key_has_a_hundred_streams_at_most_and_another_one_when_one_ends(con
         one.enter_context(http.stream("GET", address))
         for _ in range(99):
             stack.enter_context(http.stream("GET", address))
-        refused = begun()
+        refused = started()
         assert "event: trouble" in refused and "follows 100 logs and pages already" in refused
         one.close()
-        wait_for(lambda: "event: parts" in begun(), 30, "the place of the one that ended")
+        wait_for(lambda: "event: parts" in started(), 30, "the place of the one that ended")
 
 
 def test_those_who_wait_for_a_turn_are_few_and_the_others_are_refused_at_once() -> None:
-    turns, begun, over = Turns("busy", at_once=1, waiting=1), threading.Event(), threading.Event()
+    turns, started, over = Turns("busy", at_once=1, waiting=1), threading.Event(), threading.Event()
 
     def work() -> None:
         with turns.turn():
-            begun.set()
+            started.set()
             over.wait()
 
     workers = [threading.Thread(target=work) for _ in range(2)]
     workers[0].start()
-    begun.wait()
+    started.wait()
     workers[1].start()
     try:
-        while turns._there._value:  # the second one waits
+        while turns._admitted._value:  # the second one waits
             threading.Event().wait(0.01)
         with pytest.raises(ClientError, match="busy; try again"), turns.turn():
             pass

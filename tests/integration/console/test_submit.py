@@ -26,9 +26,9 @@ def test_every_installed_task_has_a_wizard_with_its_own_settings(visitor: Visito
 
 
 def test_the_wizard_shows_the_yaml_that_it_submits(console: Console, visitor: Visitor) -> None:
-    given = {"worlds": "8", "ppo__gamma": "0.9", "ppo__learning_rate": "3e-4", "sac__tau": "0.1"}
-    given = {f"train__{name}": value for name, value in given.items()}
-    fields = filled(visitor, "Cartpole", **given, train__config__rewards__alive="0.2", nodes="{min: 1, max: 2}")
+    supplied = {"worlds": "8", "ppo__gamma": "0.9", "ppo__learning_rate": "3e-4", "sac__tau": "0.1"}
+    supplied = {f"train__{name}": value for name, value in supplied.items()}
+    fields = filled(visitor, "Cartpole", **supplied, train__config__rewards__alive="0.2", nodes="{min: 1, max: 2}")
     result = checked(visitor, fields)
     assert result["problem"] is None and result["help"] is None
     job, _ = strict_yaml.load(result["yaml"])

@@ -40,8 +40,14 @@ class AwsBench(Bench):
         self.aws = aws
         self.volume = Store(home / "efs").open()
         settings = {"store": str(self.volume.path), "poll": 0.1, "quiet": 1.0, **config}
-        told = {"region": "us-east-1", "job_queue": "default", "image": "muster", "endpoint_url": aws.url, **settings}
-        save_config(home, AwsConfig(**told))
+        reported = {
+            "region": "us-east-1",
+            "job_queue": "default",
+            "image": "muster",
+            "endpoint_url": aws.url,
+            **settings,
+        }
+        save_config(home, AwsConfig(**reported))
         super().__init__(home, self.volume if config.get("store_is_shared") else None)
 
     def new_engine(self) -> AwsBatchEngine:
@@ -262,20 +268,22 @@ def test_nodes_have_the_file_system_where_the_engine_says(aws: Serving, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("epoch", "claim", "said"),
+    ("epoch", "claim", "output"),
     [
         (9, (), "the run now belongs to epoch 9"),
         (1, (Claim("", "another-job", 2),), "attempt 2 of job another-job has epoch 1 already; leaving"),
     ],
 )
-def test_a_run_of_another_attempt_refuses_it(bench: AwsBench, epoch: int, claim: tuple[Claim, ...], said: str) -> None:
+def test_a_run_of_another_attempt_refuses_it(
+    bench: AwsBench, epoch: int, claim: tuple[Claim, ...], output: str
+) -> None:
     volume = bench.volume.run("run")
     volume.create({"run": "run"})
     raise_epoch(volume, epoch, *claim)
     [node] = bench.ended(bench.launch(bench.gang("echo wrote", 1)))
     assert node.exit_code == 3 and read_epoch(volume) == epoch
     lines = [line.text for line in bench.lines()]
-    assert not any("wrote" in line for line in lines) and any(said in line for line in lines), lines
+    assert not any("wrote" in line for line in lines) and any(output in line for line in lines), lines
 
 
 def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -286,16 +294,16 @@ def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monk
         assert node.running
         return node.words if "500" in node.words else ""
 
-    said = wait_for(reason, 10, "the reason")
-    assert said.startswith("AWS Batch: ") and "CPUs" in said
+    output = wait_for(reason, 10, "the reason")
+    assert output.startswith("AWS Batch: ") and "CPUs" in output
     limit = bench.engine.capacity().limits
     assert isinstance(limit, Limit) and limit.queue == "aws-batch/default" and limit.resources.cpus > 0
-    away = AwsBench(bench.aws, bench.home)
+    absent = AwsBench(bench.aws, bench.home)
     nowhere = boto3.client("batch", region_name="us-east-1", endpoint_url="http://127.0.0.1:9")
-    away.engine._batch = away.engine._submitting = nowhere  # AWS was there at the start
-    [node] = status_of(away.engine, handle)
+    absent.engine._batch = absent.engine._submitting = nowhere  # AWS was there at the start
+    [node] = status_of(absent.engine, handle)
     assert node.running and "does not answer" in node.words and node.stale == node.words
-    bench.engine._batch, there = nowhere, bench.engine._batch
+    bench.engine._batch, existing = nowhere, bench.engine._batch
     monkeypatch.setattr(aws_batch, "_ENDING", 0.1)
     with pytest.raises(
         Transient, match=r"^the aws-batch engine has not ended gang .*; last answer: AWS Batch does not"
@@ -306,10 +314,10 @@ def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monk
     monkeypatch.setattr(aws_batch, "_CAPACITY_AGE", 0.0)
     with pytest.raises(NotYet, match="AWS Batch does not tell its capacity"):
         bench.engine.capacity()
-    bench.engine._batch = there
+    bench.engine._batch = existing
     assert bench.engine.capacity().limits == limit
     with pytest.raises(NotYet, match="does not answer"):
-        away.engine.launch(away.engine.plan(bench.gang(attempt=2)))
+        absent.engine.launch(absent.engine.plan(bench.gang(attempt=2)))
 
 
 MOUNTS = """\

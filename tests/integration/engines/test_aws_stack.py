@@ -38,7 +38,7 @@ def _definition(
 ) -> Any:
     """moto takes every definition of a template for one of a single container; this passes on what it is."""
     properties = cloudformation_json["Properties"]
-    given: dict[str, Any] = dict(
+    supplied: dict[str, Any] = dict(
         def_name=resource_name,
         parameters={},
         _type=properties["Type"],
@@ -51,7 +51,7 @@ def _definition(
         platform_capabilities=None,
         propagate_tags=properties["PropagateTags"],
     )
-    return batch.batch_backends[account_id][region_name].register_job_definition(**given)
+    return batch.batch_backends[account_id][region_name].register_job_definition(**supplied)
 
 
 _environment_of = batch.ComputeEnvironment.create_from_cloudformation_json
@@ -313,32 +313,32 @@ def test_status_lists_the_resources_and_writes_the_engine_s_configuration(accoun
     assert "image " in account.muster("status").stdout and "not pushed" not in account.muster("status").stdout
     before = (account.home / "aws.json").read_text()
     (account.home / "aws.json").unlink()
-    told = json.loads(account.muster("status", "--json", "--write").stdout)
+    reported = json.loads(account.muster("status", "--json", "--write").stdout)
     assert (account.home / "aws.json").read_text() == before
     (account.home / "aws.json").write_text(json.dumps({**json.loads(before), "poll": "2"}))
     refused = account.muster("status", "--write").stderr
     assert refused.splitlines()[-1].endswith("aws.json: poll: expected a number, found a string ('2')")
     (account.home / "aws.json").write_text(before)
-    assert told["queue"]["status"] == "VALID" and told["outputs"]["JobQueue"] == "muster"
+    assert reported["queue"]["status"] == "VALID" and reported["outputs"]["JobQueue"] == "muster"
     assert account.muster("status", "--stack-name", "other").stderr == NO_STACK.format("other")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (["--parameter", "InstanceType=g6.xlarge"], "no such parameter; did you mean InstanceTypes?"),
         (["--template", "/no/such/file"], "template /no/such/file is missing"),
     ],
 )
-def test_a_wrong_call_is_refused_before_anything_is_asked(account: Account, arguments: list[str], said: str) -> None:
+def test_a_wrong_call_is_refused_before_anything_is_asked(account: Account, arguments: list[str], output: str) -> None:
     refused = account.muster("up", *arguments)
-    assert refused.returncode == 1 and said in refused.stderr and refused.stderr.count("\n") == 1
+    assert refused.returncode == 1 and output in refused.stderr and refused.stderr.count("\n") == 1
 
 
 def test_without_credentials_or_region_it_says_what_to_do(account: Account) -> None:
     refused = account.muster("status", AWS_ACCESS_KEY_ID="", AWS_SECRET_ACCESS_KEY="")
-    said = "muster: AWS: no credentials; run `aws configure`, or set AWS_PROFILE\n"
-    assert (refused.returncode, refused.stderr) == (1, said)
+    output = "muster: AWS: no credentials; run `aws configure`, or set AWS_PROFILE\n"
+    assert (refused.returncode, refused.stderr) == (1, output)
     refused = account.muster("status", AWS_DEFAULT_REGION="")
     assert refused.stderr == "muster: AWS: no region; give --region, or set AWS_DEFAULT_REGION\n"
     refused = account.muster("status", AWS_ENDPOINT_URL="http://127.0.0.1:9", AWS_MAX_ATTEMPTS="1")
@@ -353,15 +353,15 @@ def test_down_asks_first_removes_the_stack_and_says_that_the_volume_stays(tmp_pa
         assert "aws ecr get-login-password" in made.stdout and (tmp_path / "aws.json").exists()
         assert "WorkstationUrl" not in account.outputs(), "only on request"
         volume = account.physical("FileSystem")
-        asked = account.muster("down")  # nobody answers
-        assert asked.returncode == 1 and f"file system {volume}" in asked.stdout
+        requested = account.muster("down")  # nobody answers
+        assert requested.returncode == 1 and f"file system {volume}" in requested.stdout
         assert account.client("cloudformation").describe_stacks(StackName="muster")["Stacks"]
         [stack] = cloudformation_backends["123456789012"][REGION].stacks.values()
         stack.status = "ROLLBACK_COMPLETE"
         again = account.muster("up", "--yes", *PARAMETERS)
-        said = "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; "
+        output = "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; "
         assert again.returncode == 1
-        assert again.stderr == f"{said}remove it with `muster aws down`, then try again\n"
+        assert again.stderr == f"{output}remove it with `muster aws down`, then try again\n"
         gone = account.muster("down", "--yes")
         assert gone.returncode == 0, gone.stderr
         assert f"file system {volume}, with all runs and checkpoints, stays" in gone.stdout
@@ -381,5 +381,5 @@ def test_the_resource_that_failed_first_is_named_not_those_that_it_took_along() 
         event("NatGateway", "CREATE_FAILED", "The maximum number of addresses has been reached."),
         event("muster", "ROLLBACK_IN_PROGRESS", "The following resource(s) failed to create: [NatGateway]."),
     ]
-    said = "NatGateway (AWS::EC2::NatGateway): The maximum number of addresses has been reached."
-    assert first_failure(events) == said
+    output = "NatGateway (AWS::EC2::NatGateway): The maximum number of addresses has been reached."
+    assert first_failure(events) == output

@@ -106,18 +106,18 @@ def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_tol
     assert not set(other.facts["addresses"]) & set(addresses)
 
 
-@pytest.mark.parametrize("told", [True, False], ids=["the gateway is told", "an engine that leaves it out"])
+@pytest.mark.parametrize("reported", [True, False], ids=["the gateway is told", "an engine that leaves it out"])
 def test_containers_reach_this_machine_where_the_engine_says(
-    bench: DockerBench, monkeypatch: pytest.MonkeyPatch, told: bool
+    bench: DockerBench, monkeypatch: pytest.MonkeyPatch, reported: bool
 ) -> None:
     networks = type(bench.client.networks)
-    asked = networks.get
+    requested = networks.get
 
     def get(self: Any, name: str) -> Any:
-        network = asked(self, name)
+        network = requested(self, name)
         [config] = network.attrs["IPAM"]["Config"]
         gateway = config.pop("Gateway", config["Subnet"].rpartition(".")[0] + ".1")
-        config.update({"Gateway": gateway} if told else {})
+        config.update({"Gateway": gateway} if reported else {})
         return network
 
     monkeypatch.setattr(networks, "get", get)
@@ -255,8 +255,8 @@ def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_
     train = bench.gang(commands=[["python", "-P", "-m", "worker.train"]] * 2)
     with pytest.raises(EngineError) as refused:
         bench.engine.launch(bench.engine.plan(train))
-    said = f"image {PLAIN} has no Muster in it (no label muster.version), which worker.train needs: "
-    assert str(refused.value) == f"{said}build it FROM the image of containers/Dockerfile"
+    output = f"image {PLAIN} has no Muster in it (no label muster.version), which worker.train needs: "
+    assert str(refused.value) == f"{output}build it FROM the image of containers/Dockerfile"
     old = "muster-test-old:1"
     made = {"repository": "muster-test-old", "tag": "1", "changes": ["LABEL muster.version=0.0.1"]}
     bench.client.api.import_image_from_data(bytes(1024), **made)
@@ -265,8 +265,8 @@ def test_an_image_without_muster_or_with_another_one_is_refused_before_anything_
             bench.engine.launch(bench.engine.plan(bench.gang(image=old)))
     finally:
         bench.client.images.remove(old)
-    said = f"image {old} has Muster 0.0.1, the controller {__version__}"
-    assert str(refused.value) == f"{said}: build it anew with the controller's version"
+    output = f"image {old} has Muster 0.0.1, the controller {__version__}"
+    assert str(refused.value) == f"{output}: build it anew with the controller's version"
     assert bench.left() == (0, 0)
 
 
@@ -278,8 +278,8 @@ def test_an_image_that_has_no_command_either_is_refused(bench: DockerBench) -> N
 
 
 def test_images_that_are_built_here_say_the_controller_s_version() -> None:
-    said = (REPOSITORY / "containers" / "Dockerfile").read_text()
-    assert f"muster.version={__version__} " in said and f"image.version={__version__} " in said
+    output = (REPOSITORY / "containers" / "Dockerfile").read_text()
+    assert f"muster.version={__version__} " in output and f"image.version={__version__} " in output
 
 
 @pytest.mark.parametrize(

@@ -66,12 +66,12 @@ def test_the_image_is_pushed_under_its_version_and_latest(registry: str, docker_
 
 @pytest.mark.usefixtures("docker_client")
 def test_a_missing_registry_or_image_is_reported_in_one_line() -> None:
-    for arguments, said in (
+    for arguments, output in (
         ((), "make push needs REGISTRY, such as REGISTRY=registry.example.com:5000/robots"),
         (("REGISTRY=r", "IMAGE=muster-test-no-such"), "there is no image muster-test-no-such; make image builds it"),
     ):
         refused = make(*arguments)
-        assert refused.returncode != 0 and refused.stderr.splitlines()[0] == said
+        assert refused.returncode != 0 and refused.stderr.splitlines()[0] == output
 
 
 # -- make cluster -------------------------------------------------------------------------------------------------------
@@ -89,12 +89,12 @@ def make_cluster(folder: Path, *arguments: str) -> tuple[subprocess.CompletedPro
         double.write_text(DOUBLE)
         double.chmod(0o755)
         (folder / "Makefile").symlink_to(REPOSITORY / "Makefile")
-    told = folder / "told"
-    told.write_text("")
-    env = {**os.environ, "PATH": f"{double.parent}:{os.environ['PATH']}", "TOLD": str(told)}
+    reported = folder / "told"
+    reported.write_text("")
+    env = {**os.environ, "PATH": f"{double.parent}:{os.environ['PATH']}", "TOLD": str(reported)}
     command = ["make", "cluster", *arguments]
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=120)
-    return done, told.read_text().splitlines()
+    return done, reported.read_text().splitlines()
 
 
 @pytest.mark.parametrize("kept", [False, True], ids=["on the command line", "in the cluster's environment"])
@@ -104,20 +104,20 @@ def test_a_port_in_use_is_reported_before_anything_starts(tmp_path: Path, kept: 
         if kept:
             (tmp_path / ".cluster").mkdir()
             (tmp_path / ".cluster" / "environment").write_text(f"MUSTER_TOKEN=x\nMUSTER_PORT={port}\n")
-        done, told = make_cluster(tmp_path, *([] if kept else [f"MUSTER_PORT={port}"]))
+        done, reported = make_cluster(tmp_path, *([] if kept else [f"MUSTER_PORT={port}"]))
     assert done.returncode != 0
-    said = done.stderr.splitlines()[0]
-    assert said.startswith(f"port {port} of this machine is taken") and "make cluster MUSTER_PORT=" in said
-    assert not [line for line in told if " build " in line or " up " in line]
+    output = done.stderr.splitlines()[0]
+    assert output.startswith(f"port {port} of this machine is taken") and "make cluster MUSTER_PORT=" in output
+    assert not [line for line in reported if " build " in line or " up " in line]
 
 
 def test_the_image_is_always_built_with_ray_and_is_the_one_that_runs(tmp_path: Path) -> None:
     port = free_port()
     for _ in range(2):  # an image of that name is there the second time
-        done, told = make_cluster(tmp_path, "IMAGE=robots:2", f"MUSTER_PORT={port}")
+        done, reported = make_cluster(tmp_path, "IMAGE=robots:2", f"MUSTER_PORT={port}")
         assert done.returncode == 0, done.stdout + done.stderr
-        [build] = [line for line in told if " build " in line]
+        [build] = [line for line in reported if " build " in line]
         assert "-t robots:2 " in build and "EXTRAS=worker,ray" in build
-        [up] = [line for line in told if " up " in line]
-        assert up.startswith("MUSTER_IMAGE=robots:2 docker compose ") and told.index(build) < told.index(up)
+        [up] = [line for line in reported if " up " in line]
+        assert up.startswith("MUSTER_IMAGE=robots:2 docker compose ") and reported.index(build) < reported.index(up)
         assert f"MUSTER_URL=http://127.0.0.1:{port} MUSTER_TOKEN=" in done.stdout

@@ -94,7 +94,9 @@ def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monke
     relay.open()
     monkeypatch.setenv("DOCKER_HOST", f"unix://{relay.path}")
     served = Serving(tmp_path, "--engine", "docker", "--cpus", "4")
-    away = "no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST"
+    absent = (
+        "no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST"
+    )
 
     def says(job: str, status: str, reason: str) -> bool:
         found = served.detail(job)
@@ -107,10 +109,12 @@ def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monke
             wait_for(lambda job=job: says(job, "RUNNING", "attempt 1 runs on 1 node"), 30, "its start")
         relay.cut()
         third = plain(served, PLAIN, "echo here", **host_files())
-        wait_for(lambda: says(first, "RUNNING", away) and says(third, "STARTING", away), 20, "the reason")
+        wait_for(lambda: says(first, "RUNNING", absent) and says(third, "STARTING", absent), 20, "the reason")
         served.client.batch("TerminateJob", jobId=first, reason="enough")
-        refused = f"attempt 1 can't be stopped: {away}; trying again"
-        wait_for(lambda: says(first, "RUNNING", refused) and says(second, "RUNNING", away), 20, "a stop that is tried")
+        refused = f"attempt 1 can't be stopped: {absent}; trying again"
+        wait_for(
+            lambda: says(first, "RUNNING", refused) and says(second, "RUNNING", absent), 20, "a stop that is tried"
+        )
         relay.open()
         assert served.wait(first)["statusReason"] == "enough"
         assert served.wait(third)["status"] == "SUCCEEDED" and served.log(third) == ["here"]
@@ -121,8 +125,8 @@ def test_a_docker_engine_is_waited_for(docker_client: Any, tmp_path: Path, monke
     finally:
         served.close()
     assert served.process.stderr is not None
-    said = served.process.stderr.read()
-    assert said.count("no Docker Engine answers") <= 2 and "Traceback" not in said and "store" not in said, said
+    output = served.process.stderr.read()
+    assert output.count("no Docker Engine answers") <= 2 and "Traceback" not in output and "store" not in output, output
 
 
 @pytest.mark.skipif(not Path("/var/run/docker.sock").exists(), reason="NO /var/run/docker.sock: nothing to cut off")
@@ -233,14 +237,14 @@ def test_a_gang_outlives_a_controller_that_does_not_serve_its_engine(docker_clie
         job = plain(served, PLAIN, POLITE, "docker", **host_files())
         address = served.wait(job, "RUNNING")["attempts"][0]["nodes"][0]["address"]
         again("--engine", "local")
-        away = "engine docker is not served now; start muster serve with --engine docker"
-        wait_for(lambda: says(away), 20, "the reason")
+        absent = "engine docker is not served now; start muster serve with --engine docker"
+        wait_for(lambda: says(absent), 20, "the reason")
         again(*both)
         wait_for(lambda: says("attempt 1 runs on 1 node"), 20, "it is seen again")
         again("--engine", "local")
-        wait_for(lambda: says(away), 20, "the reason")
+        wait_for(lambda: says(absent), 20, "the reason")
         served.client.batch("TerminateJob", jobId=job, reason="enough")
-        wait_for(lambda: says(f"attempt 1 can't be stopped: {away}; trying again"), 20, "a stop that is tried")
+        wait_for(lambda: says(f"attempt 1 can't be stopped: {absent}; trying again"), 20, "a stop that is tried")
         assert len(containers()) == 1
         assert served.detail(job)["attempts"][0]["nodes"][0]["address"] == address
         again(*both)
@@ -324,10 +328,10 @@ def refused(home: Path, engine: str, code: int = 1, **env: str) -> str:
 def test_an_engine_that_is_not_there_is_refused_before_anything_is_made(tmp_path: Path) -> None:
     assert refused(tmp_path, "dokcer", 2) == "muster: --engine dokcer: unknown engine; did you mean docker?\n"
     assert not (tmp_path / "muster.db").exists()
-    said = "muster: no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST\n"
-    assert refused(tmp_path, "docker", DOCKER_HOST="unix:///nowhere.sock") == said
-    said = refused(tmp_path, "slurm", PATH="/nowhere")
-    assert said.startswith("muster: scontrol is not installed here: the slurm engine uses the cluster's own")
+    output = "muster: no Docker Engine answers (No such file or directory); start it (systemctl start docker), or set DOCKER_HOST\n"
+    assert refused(tmp_path, "docker", DOCKER_HOST="unix:///nowhere.sock") == output
+    output = refused(tmp_path, "slurm", PATH="/nowhere")
+    assert output.startswith("muster: scontrol is not installed here: the slurm engine uses the cluster's own")
 
 
 @pytest.mark.usefixtures("docker_client")
@@ -348,8 +352,8 @@ def test_without_slurm_s_controller_nothing_starts(tmp_path: Path) -> None:
         "ClusterName=away\nSlurmctldHost=localhost\nSlurmctldPort=1\nAuthType=auth/none\nCredType=cred/none\n"
         "NodeName=n1\nPartitionName=p Nodes=n1\nMessageTimeout=2\n"
     )
-    said = refused(tmp_path, "slurm", SLURM_CONF=str(configuration))
-    assert said.startswith("muster: slurmctld does not answer (") and said.endswith("see `scontrol ping`\n")
+    output = refused(tmp_path, "slurm", SLURM_CONF=str(configuration))
+    assert output.startswith("muster: slurmctld does not answer (") and output.endswith("see `scontrol ping`\n")
 
 
 def test_a_missing_configuration_of_slurm_is_reported_as_such(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -367,8 +371,8 @@ def test_a_missing_configuration_of_slurm_is_reported_as_such(tmp_path: Path, mo
 @pytest.mark.parametrize("engine", ["local", "ray"])
 def test_an_engine_that_may_not_mount_says_so_by_its_name(engine: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("os.geteuid", lambda: 1000)
-    said = f"^volume /mnt: the {engine} engine mounts only as root; start `muster serve`"
-    with pytest.raises(EngineError, match=said):
+    output = f"^volume /mnt: the {engine} engine mounts only as root; start `muster serve`"
+    with pytest.raises(EngineError, match=output):
         with_mounts(["true"], [Mount("/data", "/mnt")], engine)
 
 

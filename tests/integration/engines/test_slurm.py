@@ -66,7 +66,7 @@ def test_a_job_for_more_hosts_than_there_are_says_what_it_waits_for(bench: Slurm
 
 
 @pytest.mark.parametrize(
-    ("state", "away"),
+    ("state", "absent"),
     [
         ("IDLE", False),
         ("MIXED+PLANNED", False),
@@ -81,11 +81,11 @@ def test_a_job_for_more_hosts_than_there_are_says_what_it_waits_for(bench: Slurm
     ],
 )
 def test_a_node_that_slurm_would_boot_is_a_host_others_are_away(
-    state: str, away: bool, monkeypatch: pytest.MonkeyPatch
+    state: str, absent: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     line = f"NodeName=n1 CPUTot=4 RealMemory=8192 State={state} Gres=gpu:2\nNodeName=n2 State=FUTURE\n"
     monkeypatch.setattr(slurm_commands, "call", lambda *command: line)
-    assert [(host.name, host.unavailable) for host in list_hosts()] == [("slurm/n1", away)]
+    assert [(host.name, host.unavailable) for host in list_hosts()] == [("slurm/n1", absent)]
 
 
 def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -105,22 +105,24 @@ def test_every_node_gets_its_contract_and_environment_whole(bench: SlurmBench, m
     )
     handle = bench.launch(gang)
     assert [node.exit_code for node in bench.ended(handle)] == [0, 0, 0], Path(handle.facts["output"]).read_text()
-    told = sorted((json.loads(line) for line in bench.log() if line.startswith("{")), key=lambda env: int(env["NODE"]))
-    assert [env["AWS_BATCH_JOB_NODE_INDEX"] for env in told] == ["0", "1", "2"]
-    assert [env["RANK"] for env in told] == ["1", "0", "2"], "rank 0 is on the main node"
-    assert [env["SLURMD_NODENAME"] for env in told] == ["n2", "n1", "n3"], "which comes first"
+    reported = sorted(
+        (json.loads(line) for line in bench.log() if line.startswith("{")), key=lambda env: int(env["NODE"])
+    )
+    assert [env["AWS_BATCH_JOB_NODE_INDEX"] for env in reported] == ["0", "1", "2"]
+    assert [env["RANK"] for env in reported] == ["1", "0", "2"], "rank 0 is on the main node"
+    assert [env["SLURMD_NODENAME"] for env in reported] == ["n2", "n1", "n3"], "which comes first"
     addresses = bench.cluster.addresses
-    assert [env["MUSTER_ADDRESS"] for env in told] == [addresses[name] for name in ("n2", "n1", "n3")]
-    assert [node.address for node in status_of(bench.engine, handle)] == [env["MUSTER_ADDRESS"] for env in told]
+    assert [env["MUSTER_ADDRESS"] for env in reported] == [addresses[name] for name in ("n2", "n1", "n3")]
+    assert [node.address for node in status_of(bench.engine, handle)] == [env["MUSTER_ADDRESS"] for env in reported]
     assert [node.host for node in status_of(bench.engine, handle)] == ["slurm/n2", "slurm/n1", "slurm/n3"]
-    for env in told:
+    for env in reported:
         assert (env["HARD"], env["odd.name"], env["cwd"]) == (hard, "1", "/usr/share")
         assert env["SLURM_JOB_NAME"] == gang.title
-        assert (env["MASTER_ADDR"], env["MASTER_PORT"]) == (addresses["n1"], told[0]["MASTER_PORT"])
+        assert (env["MASTER_ADDR"], env["MASTER_PORT"]) == (addresses["n1"], reported[0]["MASTER_PORT"])
         assert env["CUDA_VISIBLE_DEVICES"] == "0,1", "as Slurm set it"
         assert env["FROM_THE_CONTROLLER"] == "kept" and env["MUSTER_GANG"] == f"{bench.job}/1/1"
         assert not {"MUSTER_TOKEN", "MUSTER_DATABASE", "SLURM_RESTART_COUNT", "OF_THE_CONTROLLER"} & set(env)
-    assert "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS" not in told[1]
+    assert "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS" not in reported[1]
 
 
 def test_a_node_sees_its_gpus_alone_and_each_job_has_a_port(bench: SlurmBench, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,9 +249,9 @@ def test_slurm_gets_the_script_of_the_plan(bench: SlurmBench) -> None:
 
 def test_a_gang_that_does_not_heed_sigterm_gets_sigkill_after_the_grace(bench: SlurmBench) -> None:
     stubborn = bench.ready(bench.gang(STUBBORN, grace=60.0))
-    asked = time.monotonic()
+    requested = time.monotonic()
     assert bench.stopped(stubborn, 1.0) == [137]
-    assert time.monotonic() - asked > 0.9
+    assert time.monotonic() - requested > 0.9
 
 
 def test_a_gang_that_is_stopped_while_it_starts_leaves_nothing(bench: SlurmBench) -> None:

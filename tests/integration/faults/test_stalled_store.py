@@ -63,7 +63,7 @@ def hanging(run: Run) -> list[Path]:
     return [path for path in (run.path, *run.path.rglob("*")) if path.is_dir()]
 
 
-def asked(server: Server, path: str) -> httpx.Response:
+def requested(server: Server, path: str) -> httpx.Response:
     return httpx.get(f"{server.url}{path}", timeout=60)
 
 
@@ -73,11 +73,11 @@ def test_hanging_reads_keep_neither_the_loop_nor_a_stop_nor_a_submission_waiting
         await_status(client, job, "RUNNING")
         with stalled(*hanging(server.store.run("taught")), *hanging(server.store.run("running"))):
             paths = ["/api/runs/taught", "/api/runs/taught/metrics", f"/api/jobs/{job}", "/runs/taught"] * 5
-            reads = [threads.submit(asked, server, path) for path in paths]
+            reads = [threads.submit(requested, server, path) for path in paths]
             wait_for(lambda: connections_of(server) == 0, 10, "that no request holds a connection")
             for _ in range(10):
-                assert asked(server, "/healthz").status_code == 200
-            assert "muster_store_calls{" in asked(server, "/metrics").text
+                assert requested(server, "/healthz").status_code == 200
+            assert "muster_store_calls{" in requested(server, "/metrics").text
             assert server.controller.monitoring.loop_age < 5 and not any(read.done() for read in reads)
             client.batch("TerminateJob", jobId=job, reason="enough")
             other = submit_gang(client, "pass")
@@ -92,7 +92,7 @@ def test_hanging_reads_keep_neither_the_loop_nor_a_stop_nor_a_submission_waiting
             else:
                 assert answer.status_code == 503 and "does not answer" in answer.text
         await_status(client, job, "FAILED")
-        assert asked(server, "/api/runs/taught").status_code == 200
+        assert requested(server, "/api/runs/taught").status_code == 200
 
 
 def test_no_request_reads_the_store_inside_a_transaction(server: Server) -> None:
@@ -105,7 +105,7 @@ def test_no_request_reads_the_store_inside_a_transaction(server: Server) -> None
         assert len(paths) > 20
         for start in range(0, len(paths), AT_ONCE):
             with stalled(*hanging(server.store.run("taught")), *hanging(server.store.run("running"))):
-                sent = {path: threads.submit(asked, server, path) for path in paths[start : start + AT_ONCE]}
+                sent = {path: threads.submit(requested, server, path) for path in paths[start : start + AT_ONCE]}
                 time.sleep(1.5)
                 wait_for(lambda: connections_of(server) == 0, 2, f"that none of {list(sent)} holds a connection")
             assert all(answer.result().status_code < 504 for answer in sent.values())
@@ -153,14 +153,14 @@ def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Serv
 def test_a_store_whose_volume_is_known_to_be_silent_is_not_even_tried(server: Server) -> None:
     with stalled(server.store.path):
         wait_for(lambda: server.controller.access.disk.unavailable("store"), 60, "that the volume is silent")
-        answer = asked(server, "/api/runs")
+        answer = requested(server, "/api/runs")
         assert answer.status_code == 503 and "has not answered since" in answer.json()["message"]
-        assert asked(server, "/api/jobs").status_code == 200
+        assert requested(server, "/api/jobs").status_code == 200
 
 
-@pytest.mark.parametrize("there", ["nothing", "another store"])
+@pytest.mark.parametrize("existing", ["nothing", "another store"])
 def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
-    server: Server, tmp_path: Path, there: str
+    server: Server, tmp_path: Path, existing: str
 ) -> None:
     path = server.store.path
     with Client(server.url) as client:
@@ -168,32 +168,34 @@ def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
         await_status(client, job, "RUNNING")
         path.rename(tmp_path / "unmounted")
         try:
-            if there == "another store":
+            if existing == "another store":
                 add_run(Store(path).open(), "foreign")
             message = (
-                f"{'another store is' if there == 'another store' else 'there is no store'} at {path}; see whether"
+                f"{'another store is' if existing == 'another store' else 'there is no store'} at {path}; see whether"
             )
-            assert asked(server, "/api/runs/taught").status_code == 503, (
+            assert requested(server, "/api/runs/taught").status_code == 503, (
                 "what is missing is not taken for deleted meanwhile"
             )
             # the look before may have found the path empty
             wait_for(
                 lambda: message in (server.controller.access.disk.unavailable("store") or ""), 60, "that it is seen"
             )
-            answers = [asked(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/models", "/runs/taught")]
+            answers = [
+                requested(server, each) for each in ("/api/runs", "/api/runs/taught", "/api/models", "/runs/taught")
+            ]
             for asks in ("runs/taught/resume", "runs/taught/clone", "runs/taught/models"):
                 body = {"name": "copied"}
                 answers.append(httpx.post(f"{server.url}/api/{asks}", json=body, timeout=60))
             for answer in answers:
                 assert answer.status_code == 503 and message in html.unescape(answer.text), answer.text
-            assert [each["id"] for each in asked(server, "/api/jobs").json()["jobs"]] == [job]
-            assert message in asked(server, f"/api/jobs/{job}").json()["storeProblem"]
+            assert [each["id"] for each in requested(server, "/api/jobs").json()["jobs"]] == [job]
+            assert message in requested(server, f"/api/jobs/{job}").json()["storeProblem"]
             client.batch("TerminateJob", jobId=job, reason="enough")
         finally:
             path.rename(tmp_path / "wrong") if path.exists() else None
             (tmp_path / "unmounted").rename(path)
         await_status(client, job, "FAILED")
-        wait_for(lambda: asked(server, "/api/runs/taught").status_code == 200, 30, "the store")
+        wait_for(lambda: requested(server, "/api/runs/taught").status_code == 200, 30, "the store")
 
 
 def test_a_download_whose_file_stalls_is_cut_off_and_keeps_nobody_waiting(server: Server) -> None:
@@ -203,7 +205,7 @@ def test_a_download_whose_file_stalls_is_cut_off_and_keeps_nobody_waiting(server
     (exports / "policy.bin").write_bytes(b"policy")
     with stalled(exports, reads=True):
         with pytest.raises(httpx.RemoteProtocolError):
-            asked(server, "/runs/taught/files/exports/policy.bin")
+            requested(server, "/runs/taught/files/exports/policy.bin")
         assert httpx.get(f"{server.url}/healthz", timeout=10).status_code == 200
         assert is_open(exports / "policy.bin")
     wait_for(lambda: not is_open(exports / "policy.bin"), 20, "that the file is closed")

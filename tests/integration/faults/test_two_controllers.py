@@ -36,8 +36,8 @@ def test_controllers_of_a_store_see_each_other_until_one_is_gone(
         assert f"the controller of {tmp_path}/{home} on " in message
         assert f"(pid {os.getpid()}) uses the store" in message
     assert first.writer(run) is None, "its own attempt"
-    said = second.writer(run) or ""
-    assert said.startswith(f"job 01234567 (attempt 2) of the controller of {tmp_path}/a on ")
+    output = second.writer(run) or ""
+    assert output.startswith(f"job 01234567 (attempt 2) of the controller of {tmp_path}/a on ")
     first._ending.set()  # as if killed: its heartbeat stays, and grows no more
     wait_for(lambda: second.writer(run) is None, 20, "the first controller to count as gone")
     second.close()

@@ -56,8 +56,8 @@ class Controller:
         variables = {"MUSTER_SPEC": json.dumps(spec), "MUSTER_RUN": name, "MUSTER_ON_CHILD_FAILURE": "restart"}
         definition = multinode(name, container(["python", "-c", FOREVER], "1", variables))
         registered = self.client.batch("RegisterJobDefinition", **definition)
-        asked = {"jobName": name, "jobQueue": "default", "jobDefinition": registered["jobDefinitionArn"]}
-        job = str(self.client.batch("SubmitJob", **asked)["jobId"])
+        requested = {"jobName": name, "jobQueue": "default", "jobDefinition": registered["jobDefinitionArn"]}
+        job = str(self.client.batch("SubmitJob", **requested)["jobId"])
         self.wait(job, "RUNNING")
         return job
 
@@ -144,13 +144,13 @@ def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate(
     controller.end(first)
     controller.save(20)
     controller.look()
-    said = controller.muster("list").stdout
-    assert said.endswith("2 automatic evaluations are not shown; --all shows them\n")
+    output = controller.muster("list").stdout
+    assert output.endswith("2 automatic evaluations are not shown; --all shows them\n")
     every = controller.muster("list", "--all").stdout
     assert "evaluates taught@20" in every and "evaluates taught@10; the test says so" in every
     assert "not shown" not in every
-    told = json.loads(controller.muster("list", "--json").stdout)
-    assert [each.get("automaticEvaluation") for each in told] == ["taught@20", "taught@10", None]
+    reported = json.loads(controller.muster("list", "--json").stdout)
+    assert [each.get("automaticEvaluation") for each in reported] == ["taught@20", "taught@10", None]
     shown = " ".join(controller.muster("show", first).stdout.split())
     assert "evaluates: taught@10" in shown and controller.newest()["iteration"] == 20
 
@@ -268,7 +268,7 @@ NEEDS, UNKNOWN = "evaluation: each node needs 1 CPU, 1 GPU", "evaluation: there 
 
 
 @pytest.mark.parametrize(
-    ("line", "section", "said"),
+    ("line", "section", "output"),
     [
         ("submit job_specs/cartpole.yaml --set nodes=1", "resources: {gpus: 1}", NEEDS),
         ("submit job_specs/cartpole.yaml --set nodes=1", "queue: nowhere", UNKNOWN),
@@ -278,11 +278,11 @@ NEEDS, UNKNOWN = "evaluation: each node needs 1 CPU, 1 GPU", "evaluation: there 
         ("clone taught --name twin", "resources: {gpus: 1}", NEEDS),
     ],
 )
-def test_evaluations_that_never_start_are_refused(controller: Controller, line: str, section: str, said: str) -> None:
+def test_evaluations_that_never_start_are_refused(controller: Controller, line: str, section: str, output: str) -> None:
     add_run(controller.server.store, "taught")
     controller.save(3)
     done = controller.muster(*line.split(), "--set", f"evaluation={{every: 2, {section}}}")
-    assert done.returncode == 2 and said in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
+    assert done.returncode == 2 and output in done.stderr and len(done.stderr.strip().splitlines()) == 1, done.stderr
     with controller.server.controller.database.session() as session:
         assert not session.scalars(select(Job)).all()
 

@@ -39,7 +39,7 @@ def test_a_cancelled_gang_is_started_again_with_a_notice_until_its_limit(
             wait_for(lambda name=name: name in cluster.gangs, 30, f"attempt {attempt}")
             bench.wait("job", Status.RUNNING)
             for index in range(2):
-                left = Outcome(index, attempt, 75, None, "left on request", None, 1.0, 2.0, asked=True)
+                left = Outcome(index, attempt, 75, None, "left on request", None, 1.0, 2.0, requested=True)
                 write_outcome(bench.store.run("job"), "job", attempt, left)
                 cluster.end(name, index, 75)
                 cluster.gangs[name][index] = replace(cluster.gangs[name][index], cause=Cause.CANCELLED, words=HOW)
@@ -52,6 +52,6 @@ def test_a_cancelled_gang_is_started_again_with_a_notice_until_its_limit(
         assert found == [("cancelled", HOW)] * (limit + 1)
         notes = [[node.contract.note for node in plan.nodes] for plan in cluster.launched]
         assert notes == [["", ""], *([f"muster: attempt {number} was {HOW}"] * 2 for number in range(1, limit + 1))]
-        said = [record.getMessage() for record in caplog.records if HOW in record.getMessage()]
-        assert said[0] == f"job job: attempt 1 was {HOW}; starting again (1 of {limit} times)"
-        assert len(said) == limit + 1
+        output = [record.getMessage() for record in caplog.records if HOW in record.getMessage()]
+        assert output[0] == f"job job: attempt 1 was {HOW}; starting again (1 of {limit} times)"
+        assert len(output) == limit + 1

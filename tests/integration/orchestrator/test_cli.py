@@ -28,7 +28,7 @@ SPEC = "job_specs/cartpole.yaml"
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (["run", "{spec}"], "{spec}:2: nodes: expected an integer number of nodes"),
         (["submit", "nowhere.yaml"], "nowhere.yaml: No such file"),
@@ -37,11 +37,11 @@ SPEC = "job_specs/cartpole.yaml"
     ],
 )
 def test_a_bad_spec_file_or_change_is_refused_before_any_controller(
-    tmp_path: Path, arguments: list[str], said: str
+    tmp_path: Path, arguments: list[str], output: str
 ) -> None:
     spec, home = tmp_path / "job.yaml", tmp_path / "home"
     spec.write_text("name: a\nnodes: two\ncommand: [x]\n")
-    refused([each.format(spec=spec) for each in arguments], home, 2, said.format(spec=spec))
+    refused([each.format(spec=spec) for each in arguments], home, 2, output.format(spec=spec))
     assert not home.exists()
 
 
@@ -51,10 +51,10 @@ def test_more_than_any_host_has_is_refused_before_anything_is_registered(shared_
         ("resources.cpus=512", ["512 CPUs", "the largest host has 8 CPUs"]),
         ("nodes=200", ["needs 200 nodes", "all hosts together have"]),
     ]:
-        said = refusal(shared_server, "submit", SPEC, "--set", change)
-        assert all(part in said for part in ("cartpole.yaml: resources:", *parts)), said
-    said = refusal(shared_server, "submit", SPEC, "--engine", "rya")
-    assert "--engine rya: unknown engine; did you mean ray?" in said
+        output = refusal(shared_server, "submit", SPEC, "--set", change)
+        assert all(part in output for part in ("cartpole.yaml: resources:", *parts)), output
+    output = refusal(shared_server, "submit", SPEC, "--engine", "rya")
+    assert "--engine rya: unknown engine; did you mean ray?" in output
 
 
 def test_a_server_that_can_t_start_says_why(shared_server: Serving, tmp_path: Path) -> None:
@@ -68,12 +68,12 @@ def test_a_server_that_can_t_start_says_why(shared_server: Serving, tmp_path: Pa
         port = str(holder.getsockname()[1])
         refused(["serve", "--port", port], home, 1, f"can't listen on 127.0.0.1:{port}", "--port")
     refused([*serve, "--host", "0.0.0.0"], home, 1, "set MUSTER_TOKEN")
-    for option, said in (
+    for option, output in (
         (["--engine", "rya"], "unknown engine; did you mean ray?"),
         (["--trust-proxy", "x"], "give the proxy's"),
         (["--min-free", "lots"], "lots: expected a size such as 1GiB, a share such as 5%, or 0"),
     ):
-        refused([*serve, *option], home, 2, option[0], said)
+        refused([*serve, *option], home, 2, option[0], output)
 
 
 def test_commands_without_a_controller_say_how_to_start_one_and_take_no_other(tmp_path: Path) -> None:
@@ -223,10 +223,10 @@ def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Se
     assert running.stdout is not None
     wait_for(lambda: "RUNNABLE" in running.stdout.readline(), 30, "the job waits")
     running.send_signal(signal.SIGTERM)  # is taken as Ctrl-C is
-    said, errors = running.communicate(timeout=60 * PATIENCE)
+    output, errors = running.communicate(timeout=60 * PATIENCE)
     stopping = "\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)\n"
-    assert (running.returncode, errors) == (130, stopping), said
-    assert "FAILED  cartpole (" in said and ": stopped with Ctrl-C" in said
+    assert (running.returncode, errors) == (130, stopping), output
+    assert "FAILED  cartpole (" in output and ": stopped with Ctrl-C" in output
     [job] = [each for each in json.loads(server.muster("list", "--json").stdout) if each["jobName"] == "cartpole"]
     never = f"job cartpole ({job['jobId'][:8]}) never started; submit it again"
     refused(["resume", server.detail(job["jobId"])["run"]], server.home, 2, never)
@@ -303,8 +303,8 @@ def test_a_server_and_short_commands_that_start_together_all_succeed(tmp_path: P
         try:
             for command in started:
                 if command is not server:
-                    said, errors = command.communicate(timeout=60 * PATIENCE)
-                    assert command.returncode == 0 and json.loads(said) == [], errors
+                    output, errors = command.communicate(timeout=60 * PATIENCE)
+                    assert command.returncode == 0 and json.loads(output) == [], errors
             assert server.stdout is not None and server.stdout.readline().startswith("Muster serves http")
         finally:
             server.terminate()
@@ -312,7 +312,7 @@ def test_a_server_and_short_commands_that_start_together_all_succeed(tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("node", "said"),
+    ("node", "output"),
     [
         ({"host": "localhost", "gpus": ["2", "3"]}, ", GPUs 2,3"),
         ({"host": "ray/n1", "gpus": ["0", "1"]}, ", 2 GPUs"),
@@ -321,8 +321,8 @@ def test_a_server_and_short_commands_that_start_together_all_succeed(tmp_path: P
         ({"host": "ray/n1", "gpus": []}, ""),
     ],
 )
-def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, Any], said: str) -> None:
-    assert _gpus(node) == said
+def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, Any], output: str) -> None:
+    assert _gpus(node) == output
 
 
 # -- muster doctor ----------------------------------------------------------------------------------------------------
@@ -331,8 +331,8 @@ def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, A
 def test_all_requirements_are_installed(tmp_path: Path) -> None:
     done = call_muster("doctor", "--worker", "--engine", "local", home=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
-    for said in ("torch 2.", "a durable write takes", "muster serve starts one", "1 host, "):
-        assert said in done.stdout
+    for output in ("torch 2.", "a durable write takes", "muster serve starts one", "1 host, "):
+        assert output in done.stdout
 
 
 def test_a_controller_is_found(shared_server: Serving) -> None:
@@ -352,13 +352,13 @@ def test_missing_parts_are_reported_with_a_remedy(tmp_path: Path) -> None:
     assert bad.returncode == 1 and "Traceback" not in bad.stderr
     lines = [line for line in bad.stdout.splitlines() if line.startswith("BAD")]
     assert len(lines) == 4
-    for said in (
+    for output in (
         "file/store: Not a directory",
         "set DOCKER_HOST",
         "there is no engine 'nothing'",
         "http://127.0.0.1:9",
     ):
-        assert any(said in line for line in lines), said
+        assert any(output in line for line in lines), output
 
 
 def test_folders_of_plug_ins_that_are_not_installed_are_named(tmp_path: Path) -> None:

@@ -71,8 +71,8 @@ def test_a_named_checkpoint_is_cloned(full: Serving, store: Store, reference: st
 @pytest.mark.usefixtures("store")
 def test_show_and_checkpoints_say_where_the_weights_are_from_and_how_sure_the_score_is(full: Serving) -> None:
     clone(full, "taught@best", "shown")
-    said = " ".join(full.muster("show", "shown").stdout.split())
-    assert "started from: taught@6 (checkpoint 00000006-e1, score 9.25 ± 0.25)" in said
+    output = " ".join(full.muster("show", "shown").stdout.split())
+    assert "started from: taught@6 (checkpoint 00000006-e1, score 9.25 ± 0.25)" in output
     listed = full.muster("checkpoints", "taught").stdout
     assert "9.25 ± 0.25" in listed and "the best" in next(line for line in listed.splitlines() if "9.25" in line)
     (first, *_) = full.client.get("/api/runs/taught/checkpoints")
@@ -176,9 +176,9 @@ def test_a_run_that_a_crash_left_without_its_job_says_what_to_do(full: Serving, 
     making.copy()
     making.publish("orphan", {"run": "orphan", "created": 1, "spec": {**SPEC, "name": "orphan"}, "queue": "default"})
     making.close()
-    said = refusal(full, "clone", "taught", "--name", "orphan", code=1)
-    assert "run orphan exists already" in said
-    assert "no job has begun it: `muster resume orphan` does, or delete " in said
+    output = refusal(full, "clone", "taught", "--name", "orphan", code=1)
+    assert "run orphan exists already" in output
+    assert "no job has begun it: `muster resume orphan` does, or delete " in output
     assert full.client.post("/api/runs/orphan/resume", {})["iteration"] == 0
     assert "no job has begun it" not in refusal(full, "clone", "taught", "--name", "orphan", code=1)
 
@@ -195,7 +195,7 @@ def student(tmp_path: Path, teacher: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("teacher", "said"),
+    ("teacher", "output"),
     [
         ("nobody@3", "run nobody does not exist"),
         ("taught@4", "run taught has no checkpoint of iteration 4; it has: 3, 6, 9"),
@@ -204,9 +204,9 @@ def student(tmp_path: Path, teacher: str) -> str:
         ("../taught", "expected RUN or RUN@ITERATION"),
     ],
 )
-def test_a_missing_teacher_is_refused(full: Serving, store: Store, tmp_path: Path, teacher: str, said: str) -> None:
+def test_a_missing_teacher_is_refused(full: Serving, store: Store, tmp_path: Path, teacher: str, output: str) -> None:
     add_run(store, "idle")
-    assert f"train.rsl_rl.teacher_checkpoint: {said}" in refusal(full, "submit", student(tmp_path, teacher))
+    assert f"train.rsl_rl.teacher_checkpoint: {output}" in refusal(full, "submit", student(tmp_path, teacher))
 
 
 def held(run: Run, teacher: str) -> list[bytes]:
@@ -237,8 +237,8 @@ def test_a_submitted_job_keeps_its_teachers_weights_for_good(full: Serving, stor
 def test_a_teacher_with_damaged_weights_is_refused_at_submission(full: Serving, store: Store, tmp_path: Path) -> None:
     add_run(store, "broken")
     (add_checkpoint(store, "broken", 2).path / "learner.pt").write_bytes(b"WEIGHTS")
-    said = refusal(full, "submit", student(tmp_path, "broken"))
-    assert "train.rsl_rl.teacher_checkpoint: run broken: checkpoint 00000002-e1: the content of learner.pt" in said
+    output = refusal(full, "submit", student(tmp_path, "broken"))
+    assert "train.rsl_rl.teacher_checkpoint: run broken: checkpoint 00000002-e1: the content of learner.pt" in output
 
 
 @pytest.mark.parametrize("fate", ["pruned", "deleted"])
@@ -265,5 +265,5 @@ def test_a_clone_with_another_teacher_holds_the_new_teacher(full: Serving, store
     clone(full, "pupil-of-two", "of-another", "--set", "train.rsl_rl.teacher_checkpoint=taught@3")
     assert held(store.run("of-another"), "taught") == [b"three"] and weights(store.run("of-another")) == b"pupil"
     change = "train.rsl_rl.teacher_checkpoint=taught@4"
-    said = refusal(full, "clone", "pupil-of-two", "--name", "of-none", "--set", change)
-    assert "run taught has no checkpoint of iteration 4" in said
+    output = refusal(full, "clone", "pupil-of-two", "--name", "of-none", "--set", change)
+    assert "run taught has no checkpoint of iteration 4" in output

@@ -176,8 +176,8 @@ def test_a_slow_reader_gets_all_of_a_large_answer(address_of_large: tuple[str, i
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 64 << 10)
         connection.settimeout(60)
         connection.connect(address_of_large)
-        begun = b"GET / HTTP/1.1\r\nHost: x\r\nContent-Le" if another else b""
-        connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" + begun)
+        started = b"GET / HTTP/1.1\r\nHost: x\r\nContent-Le" if another else b""
+        connection.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" + started)
         received = 0
         while received < len(ANSWER):
             piece = connection.recv(256 << 10)
@@ -255,8 +255,8 @@ def test_a_submission_whose_answer_was_lost_is_submitted_once(
     lost = lose(monkeypatch, "/v1/submitjob", 1)
     submitted = batch("SubmitJob", jobName="lossy-once", jobQueue="default", jobDefinition="lossy")
     assert len(lost) == 1
-    there = [{"name": "JOB_NAME", "values": ["lossy-once"]}]
-    found = batch("ListJobs", jobQueue="default", filters=there)["jobSummaryList"]
+    existing = [{"name": "JOB_NAME", "values": ["lossy-once"]}]
+    found = batch("ListJobs", jobQueue="default", filters=existing)["jobSummaryList"]
     assert [job["jobId"] for job in found] == [submitted["jobId"]]
 
 

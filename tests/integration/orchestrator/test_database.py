@@ -119,9 +119,9 @@ def test_keys_and_secrets_are_in_either_database_for_a_process_beside_its_contro
     ann, bob = keys.create("ann", ["robots"]), keys.create("bob", share="lab")
     beside = Database(url, beside=True)
     try:
-        there = OwnSecrets(beside, home)
-        others = KeyStore(there)
-        assert list(others.current().values()) == [ann, bob] and there.get("console") == "a secret"
+        existing = OwnSecrets(beside, home)
+        others = KeyStore(existing)
+        assert list(others.current().values()) == [ann, bob] and existing.get("console") == "a secret"
         others.delete("ann")
         with pytest.raises(KeyUsageError, match="there is a key bob already"):
             others.create("bob")
@@ -262,8 +262,8 @@ def test_a_database_file_of_any_path_is_private_and_has_one_controller(tmp_path:
         for other in (path, tmp_path / "link.db"):
             with pytest.raises(ServerError) as refused:
                 Server(tmp_path / "b", store=store, database=how.format(other))
-            said = f"database sqlite:///{other}: another controller has it; use that one, or stop it first"
-            assert str(refused.value) == said
+            output = f"database sqlite:///{other}: another controller has it; use that one, or stop it first"
+            assert str(refused.value) == output
         modes = {name: (tmp_path / name).stat().st_mode & 0o777 for name in ("m.db", "m.db-wal", "m.db-shm")}
         assert set(modes.values()) == {0o600}, modes
         first.close()
@@ -309,8 +309,8 @@ def test_a_controller_that_lost_its_database_refuses_writes_alone(postgresql: po
 
 def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opened: Callable[[], Database]) -> None:
     database = opened()
-    told: list[set[str]] = []
-    database.committed = lambda jobs: told.append({each.id for each in jobs})
+    reported: list[set[str]] = []
+    database.committed = lambda jobs: reported.append({each.id for each in jobs})
     with database.session() as session:
         session.add_all([job("a"), job("b")])
     with pytest.raises(RuntimeError), database.session() as session:
@@ -319,7 +319,7 @@ def test_a_commit_tells_which_jobs_it_changed_and_a_rollback_tells_nothing(opene
         raise RuntimeError
     with database.session() as session:
         session.get_one(Job, "b").status_reason = "changed"
-    assert told == [{"a", "b"}, {"b"}]
+    assert reported == [{"a", "b"}, {"b"}]
 
 
 def test_the_work_queue_is_the_same_after_a_restart(opened: Callable[[], Database]) -> None:
@@ -416,10 +416,10 @@ def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(postgresql: postg
             assert refused.value.status == 400
         running = serving.gang("import time; time.sleep(600)", name="running")
         serving.wait(running, "RUNNING")
-        with postgresql.away():
-            with pytest.raises(ApiError, match="database postgresql") as away:
+        with postgresql.absent():
+            with pytest.raises(ApiError, match="database postgresql") as absent:
                 serving.gang("pass")
-            assert away.value.status == 503
+            assert absent.value.status == 503
             health = f"{serving.url}/healthz"
             trouble = lambda: (a := httpx.get(health)).status_code == 503 and "postgresql" in a.json()["message"]  # noqa: E731
             wait_for(trouble, 30, "its trouble")

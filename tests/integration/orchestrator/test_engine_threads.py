@@ -106,12 +106,12 @@ def test_an_error_without_a_number_is_not_final() -> None:
 def refused_plan(error: OSError) -> None:
     """Plan a gang on an engine that raises this error."""
     engine = FakeEngine()
-    asked = runner.Runner(engine, lambda _: None)
+    requested = runner.Runner(engine, lambda _: None)
     engine.plan = lambda gang: (_ for _ in ()).throw(error)  # type: ignore[method-assign]
     try:
-        asked.plan(make_gang(Path("/")))
+        requested.plan(make_gang(Path("/")))
     finally:
-        asked.close()
+        requested.close()
 
 
 def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
@@ -132,8 +132,8 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
             assert node.running and node.address == "10.0.0.1"
             return node.words
 
-        said = wait_for(says, 10, "that it does not answer")
-        assert said.startswith("the fake engine has not answered since "), said
+        output = wait_for(says, 10, "that it does not answer")
+        assert output.startswith("the fake engine has not answered since "), output
         assert changed == [read_handle(handle).gang], "its job is looked at, since its reason is another one now"
         assert several.capacity(patience=60) == {"fake": fake.offered}, "what it told last"
         with pytest.raises(NotYet, match="has not answered since") as wait:
@@ -145,7 +145,7 @@ def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
         wait_for(lambda: not says(), 10, "that it answers again")
         assert read_handle(handle).gang in changed
         launched(several, gang(tmp_path, "other"))
-    assert [record.getMessage() for record in caplog.records] == [said, "the fake engine answers again"]
+    assert [record.getMessage() for record in caplog.records] == [output, "the fake engine answers again"]
     assert fake.threads == {"engine fake"}, "the constructor's thread calls no engine"
     assert fake.closed == 1
 
@@ -155,15 +155,15 @@ def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplo
     with engines(fake) as several:
         handle = launched(several, gang(tmp_path))
         wait_for(lambda: observed(several, handle), 10, "the first picture")
-        for error, said in (
+        for error, output in (
             (OSError(errno.EMFILE, "Too many"), "can't look at its gangs now ([Errno 24] Too many)"),
             (RuntimeError("no\nwords"), "failed to look at its gangs (RuntimeError: no words)"),
         ):
             fake.error = error
             [node] = wait_for(
-                lambda said=said: (s := observed(several, handle)) and said in s[0].words and s,
+                lambda output=output: (s := observed(several, handle)) and output in s[0].words and s,
                 20,
-                said,
+                output,
             )
             assert node.running
             with pytest.raises(EngineError, match="trying again"):
@@ -231,18 +231,18 @@ def test_a_transient_launch_error_keeps_the_attempts_and_a_permanent_one_ends_th
     monkeypatch.setattr("orchestrator.engines.local.engine.subprocess.Popen", refused)
     with serving(tmp_path) as client:
 
-        def shows(job: str, *wanted: str) -> dict[str, Any]:
-            def there() -> dict[str, Any] | None:
+        def shows(job: str, *requested: str) -> dict[str, Any]:
+            def existing() -> dict[str, Any] | None:
                 found: dict[str, Any] = client.get(f"/api/jobs/{job}")
-                return found if (found["status"], found["statusReason"])[: len(wanted)] == wanted else None
+                return found if (found["status"], found["statusReason"])[: len(requested)] == requested else None
 
-            found: dict[str, Any] = wait_for(there, 30, f"{job} {wanted}")
+            found: dict[str, Any] = wait_for(existing, 30, f"{job} {requested}")
             return found
 
-        said = "the local engine can't start the gang now ([Errno 11] Resource temporarily unavailable); trying again"
+        output = "the local engine can't start the gang now ([Errno 11] Resource temporarily unavailable); trying again"
         job, other = (submit_gang(client, "print('here')", attempts=3) for _ in range(2))
-        shows(job, "STARTING", said)
-        shows(other, "STARTING", said)
+        shows(job, "STARTING", output)
+        shows(other, "STARTING", output)
         client.batch("TerminateJob", jobId=other, reason="enough")
         shows(other, "FAILED", "enough")
         number[:] = [errno.E2BIG]
@@ -252,7 +252,7 @@ def test_a_transient_launch_error_keeps_the_attempts_and_a_permanent_one_ends_th
         shows(job, "STARTING")
         number.clear()
         assert len(shows(job, "SUCCEEDED")["attempts"]) == 1
-    assert sum(said in record.getMessage() for record in caplog.records) == 2, "once for each job"
+    assert sum(output in record.getMessage() for record in caplog.records) == 2, "once for each job"
 
 
 # -- a controller with an engine that hangs ----------------------------------------------------------------------------
@@ -325,8 +325,8 @@ def test_an_engine_that_hangs_later_delays_no_gang_of_another_engine(
     wait_for(lambda: len(client.get("/api/capacity")["hosts"]) > 1, 20, "the hosts of both")
     hanging.answers.clear()
     hung = submit_gang(client, "pass", queue="fake")
-    said = "the fake engine has not answered since "
-    wait_for(lambda: said in detail(client, hung)["statusReason"], 30, "the reason")
+    output = "the fake engine has not answered since "
+    wait_for(lambda: output in detail(client, hung)["statusReason"], 30, "the reason")
     # all of this while one call to the engine is in the air
     await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
     await_status(client, submit_gang(client, FOREVER, timeout=60), "RUNNING")
@@ -337,8 +337,8 @@ def test_an_engine_that_hangs_later_delays_no_gang_of_another_engine(
     client.batch("TerminateJob", jobId=running, reason="enough")
     await_status(client, running, "FAILED")
     assert detail(client, hung)["status"] in ("RUNNABLE", "STARTING")
-    told = [record for record in caplog.records if said in record.getMessage()]
-    assert len(told) == 1 and told[0].exc_info is None
+    reported = [record for record in caplog.records if output in record.getMessage()]
+    assert len(reported) == 1 and reported[0].exc_info is None
 
 
 def test_a_stop_that_is_not_answered_is_the_job_s_reason_and_tried_again(client: Client, hanging: Hanging) -> None:
@@ -347,11 +347,11 @@ def test_a_stop_that_is_not_answered_is_the_job_s_reason_and_tried_again(client:
     await_status(client, job, "RUNNING")
     hanging.deaf = True
     client.batch("TerminateJob", jobId=job, reason="enough")
-    said = (
+    output = (
         rf"attempt 1 can't be stopped: the fake engine has not ended gang {job}/1/\d+ within 0\.05 s; "
         "last answer: the daemon is away; trying again"
     )
-    wait_for(lambda: re.fullmatch(said, detail(client, job)["statusReason"]), 20, "the reason")
+    wait_for(lambda: re.fullmatch(output, detail(client, job)["statusReason"]), 20, "the reason")
     hanging.deaf = False
     await_status(client, job, "FAILED")
     assert detail(client, job)["statusReason"] == "enough"
@@ -402,11 +402,11 @@ def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_called_a_host(q
 
 
 def test_its_limit_is_told_apart_from_hosts(queued: Client, engine: FakeEngine) -> None:
-    told = queued.get("/api/capacity")
-    assert told["hosts"] == []
-    assert told["queued"] == {"fake": {"queue": "fake/q", "cpus": 8.0, "gpus": 2, "memory": 8192}}
+    reported = queued.get("/api/capacity")
+    assert reported["hosts"] == []
+    assert reported["queued"] == {"fake": {"queue": "fake/q", "cpus": 8.0, "gpus": 2, "memory": 8192}}
     metrics = httpx.get(f"{queued.url}/metrics").text
     assert 'muster_cpus{engine="fake"} 8.0' in metrics and "muster_hosts{" not in metrics
     engine.offered = Queued([Host("fake/a", 4.0, (), 1024, single=True)])
-    told = queued.get("/api/capacity")
-    assert [host["name"] for host in told["hosts"]] == ["fake/a"] and told["queued"] == {"fake": None}
+    reported = queued.get("/api/capacity")
+    assert [host["name"] for host in reported["hosts"]] == ["fake/a"] and reported["queued"] == {"fake": None}

@@ -74,9 +74,9 @@ def test_what_can_not_be_is_refused_at_submission_in_one_line(full: Serving, lin
 @pytest.mark.parametrize("kind", ["evaluate", "export", "render", "resume", "clone"])
 def test_a_run_whose_task_is_not_installed_is_refused_with_the_same_line(full: Serving, kind: str) -> None:
     more = {"render": ("-o", "film.gif"), "clone": ("--name", "again")}.get(kind, ())
-    said = refusal(full, kind, "gone", *more)
-    assert "run gone: train.task: no task is called 'Vanished'; " in said
-    assert said.rstrip().endswith("(your own: module:Class; if a plug-in provides it, install the plug-in's package)")
+    output = refusal(full, kind, "gone", *more)
+    assert "run gone: train.task: no task is called 'Vanished'; " in output
+    assert output.rstrip().endswith("(your own: module:Class; if a plug-in provides it, install the plug-in's package)")
 
 
 def test_a_plan_of_a_run_whose_task_is_not_installed_is_refused(full: Serving, tmp_path: Path) -> None:
@@ -88,14 +88,14 @@ def test_a_plan_of_a_run_whose_task_is_not_installed_is_refused(full: Serving, t
 
 def test_a_job_from_yaml_is_checked_as_the_command_s_is(full: Serving, tmp_path: Path) -> None:
     spec = tmp_path / "judge.yaml"
-    for section, said in (
+    for section, output in (
         ({"checkpoint": 4}, "no checkpoint of iteration 4"),
         ({"config": {"angel_limit": 1}}, "did you mean angle_limit?"),
         ({"checkpoint": "new"}, "evaluate.checkpoint: expected an iteration, best or latest, found 'new'"),
     ):
         spec.write_text(json.dumps({"name": "judge", "evaluate": {"run": "taught", **section}}))
         for options in ([], ["--dry-run"]):
-            assert said in refusal(full, "submit", str(spec), *options)
+            assert output in refusal(full, "submit", str(spec), *options)
     section = {"run": "taught", "checkpoint": "best", "config": {"angle_limit": 0.3}}
     spec.write_text(json.dumps({"name": "judge", "evaluate": section}))
     done = full.muster("submit", str(spec), "--json")
@@ -137,7 +137,7 @@ def test_the_curves_are_written_as_numbers_too(full: Serving, tmp_path: Path) ->
 
 
 def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) -> None:
-    for options, said in (
+    for options, output in (
         (["taught"], "that is one run, taught; name two or more to compare"),
         (["taught", "slwo"], "did you mean slow"),
         (["robot-*", "slow"], "no run matches robot-*"),
@@ -145,7 +145,7 @@ def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) 
         (["taught", "slow", "-o", str(tmp_path / "x.xyz")], "unknown ending; use one of .png, .svg, .pdf"),
         (["empty", "empty*", "of-*", "-o", str(tmp_path / "x.png")], "no run matches of-*"),
     ):
-        assert said in refusal(full, "compare", *options)
+        assert output in refusal(full, "compare", *options)
     assert list(tmp_path.iterdir()) == []
 
 

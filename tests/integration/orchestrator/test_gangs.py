@@ -169,10 +169,10 @@ def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_s
 def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    stop, asked, allowed = LocalEngine.stop, [], threading.Event()
+    stop, requested, allowed = LocalEngine.stop, [], threading.Event()
 
     def stop_if_allowed(engine: LocalEngine, handle: str, grace: float) -> None:
-        asked.append(handle)
+        requested.append(handle)
         if not allowed.is_set():
             raise EngineError("not authorized\nto perform TerminateJob")
         stop(engine, handle, grace)
@@ -182,13 +182,13 @@ def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
         job = submit_gang(client, FOREVER)
         await_status(client, job, "RUNNING")
         client.batch("TerminateJob", jobId=job, reason="enough")
-        wait_for(lambda: len(asked) > 1, 30, "another try")
-        said = "attempt 1 can't be stopped: not authorized to perform TerminateJob; trying again"
+        wait_for(lambda: len(requested) > 1, 30, "another try")
+        output = "attempt 1 can't be stopped: not authorized to perform TerminateJob; trying again"
         found = detail(client, job)
-        assert (found["status"], found["statusReason"]) == ("RUNNING", said)
+        assert (found["status"], found["statusReason"]) == ("RUNNING", output)
         allowed.set()
         assert await_status(client, job, "FAILED")["statusReason"] == "enough"
-    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"job {job}: {said}"]
+    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"job {job}: {output}"]
     assert processes_of(tmp_path) == []
 
 
@@ -239,11 +239,11 @@ def test_how_a_gang_ended_is_recorded_for_each_node(tmp_path: Path, monkeypatch:
         assert [node["reason"] for node in found["attempts"][0]["nodes"]] == killed
 
         # node 1's supervisor is asked to leave, and rank 0 is killed: node 1 was first, and is not the cause
-        told = wait_for(lambda: len(found := lines(asleep)) == 2 and found, 60, "two nodes")
-        os.kill(int(told[1].split()[2]), signal.SIGTERM)
+        reported = wait_for(lambda: len(found := lines(asleep)) == 2 and found, 60, "two nodes")
+        os.kill(int(reported[1].split()[2]), signal.SIGTERM)
         wait_for(lambda: len(processes_of(tmp_path)) == 3, 60, "node 1's end")
         assert detail(client, asleep)["status"] == "RUNNING"
-        os.kill(int(told[0].split()[1]), signal.SIGKILL)
+        os.kill(int(reported[0].split()[1]), signal.SIGKILL)
         reason = await_status(client, asleep, "FAILED")["statusReason"]
         assert reason.startswith("main node: rank 0 was killed by SIGKILL")
 

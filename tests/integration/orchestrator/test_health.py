@@ -77,9 +77,9 @@ def test_a_service_manager_hears_that_the_controller_is_ready_alive_and_stopping
             )
             assert server.wait(job)["status"] == "SUCCEEDED" and server.log(job)[0] == ""
             server.process.terminate()
-            while (heard := manager.recv(100)) == b"WATCHDOG=1":
+            while (received := manager.recv(100)) == b"WATCHDOG=1":
                 pass
-            assert heard == b"STOPPING=1"
+            assert received == b"STOPPING=1"
             assert server.process.wait(60) == 0
 
 
@@ -87,9 +87,9 @@ def test_a_controller_that_is_not_alive_sends_no_sign_of_life(tmp_path: Path) ->
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(60)
-        told = ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "20000"})
+        reported = ServiceManager({"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "20000"})
         is_alive, ended = threading.Event(), threading.Event()
-        told.keep_alive(is_alive.is_set, ended.wait)
+        reported.keep_alive(is_alive.is_set, ended.wait)
         with pytest.raises(TimeoutError):
             manager.settimeout(0.5)
             manager.recv(100)
@@ -100,6 +100,6 @@ def test_a_controller_that_is_not_alive_sends_no_sign_of_life(tmp_path: Path) ->
 
 
 def test_the_watchdog_of_another_process_is_not_ours() -> None:
-    given = {"NOTIFY_SOCKET": "@nobody", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}
-    assert ServiceManager(given).interval is None and given == {}
-    ServiceManager({"NOTIFY_SOCKET": "@nobody"}).tell("READY=1")  # a manager that is gone is no error
+    supplied = {"NOTIFY_SOCKET": "@nobody", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}
+    assert ServiceManager(supplied).interval is None and supplied == {}
+    ServiceManager({"NOTIFY_SOCKET": "@nobody"}).report("READY=1")  # a manager that is gone is no error

@@ -111,13 +111,13 @@ def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, r
 def test_no_change_of_a_run_and_no_spec_makes_an_answer_long(inside: Server, http: httpx.Client, runs: Path) -> None:
     levels = [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 8)}]" for n in range(1, 9)]
     bomb = ", ".join(["a0: &a0 [x, x, x, x, x, x, x, x]", *levels])
-    said = refused(http.post("/api/runs/a-good/resume", json={"set": [f"train.config={{{bomb}}}"]}))
-    assert "anchors and aliases (&a0) are not accepted here" in said and len(said) < 400
+    output = refused(http.post("/api/runs/a-good/resume", json={"set": [f"train.config={{{bomb}}}"]}))
+    assert "anchors and aliases (&a0) are not accepted here" in output and len(output) < 400
     train = {**SPEC["train"], "task": "my:Task", "config": {"text": "x" * 100_000}}
     spec = {**SPEC, "train": train}
     write_json(runs / "crafted" / "run.json", {"run": "crafted", "spec": spec})
-    said = refused(http.post("/api/runs/crafted/resume", json={"set": ["train.config={text: y}"]}))
-    assert "train.config.text is" in said and len(said) < 400
+    output = refused(http.post("/api/runs/crafted/resume", json={"set": ["train.config={text: y}"]}))
+    assert "train.config.text is" in output and len(output) < 400
     assert "at most 24576" in refused(http.post("/api/runs/a-good/resume", json={"set": ["name=" + "x" * 30_000]}))
 
 
@@ -282,7 +282,7 @@ def test_a_log_stream_ends_in_order_whatever_lies_there(
     logs.write_text("")
     assert [http.get(address, params={"follow": follow}).text for follow in (False, True)] == ["", ""]
     streams = {"X-Amz-Target": "Logs_20140328.DescribeLogStreams"}
-    for asked in ({}, {"orderBy": "LastEventTime"}):
-        listed = http.post("/", json={"logGroupName": "/aws/batch/job", **asked}, headers=streams)
+    for requested in ({}, {"orderBy": "LastEventTime"}):
+        listed = http.post("/", json={"logGroupName": "/aws/batch/job", **requested}, headers=streams)
         assert listed.status_code == 200, "one job's files are in the way of nothing but its own logs"
     assert "Exception in ASGI application" not in caplog.text

@@ -121,8 +121,8 @@ def test_an_upload_that_breaks_off_or_has_another_digest_keeps_nothing(server: S
         connection.sendall(head.encode() + text[: len(text) // 2].encode())
     wrong = httpx.put(f"{server.url}/api/texts/{digest_of(text)}", content=text[:-1])
     found = digest_of(text[:-1])
-    told = f"the text that came has sha256 {found}, not {digest_of(text)}; send it again"
-    assert (wrong.status_code, wrong.json()["message"]) == (400, told)
+    reported = f"the text that came has sha256 {found}, not {digest_of(text)}; send it again"
+    assert (wrong.status_code, wrong.json()["message"]) == (400, reported)
     binary = httpx.put(f"{server.url}/api/texts/{'0' * 64}", content=b"\xff")
     assert (binary.status_code, binary.json()["message"]) == (400, "the body is not a text (UTF-8)")
     large = httpx.put(f"{server.url}/api/texts/{'0' * 64}", content=b"x" * ((1 << 20) + 1))

@@ -263,8 +263,8 @@ def test_output_of_a_supervisor_before_it_reaches_the_store_is_reported(bench: L
     raise_epoch(bench.run, 5)
     handle = bench.launch(bench.gang(nodes=1, epoch=4))
     [node] = bench.ended(handle)
-    said = "muster supervisor: run run: this attempt has epoch 4, the run now belongs to epoch 5; leaving"
-    assert (node.exit_code, node.words) == (3, said)
+    output = "muster supervisor: run run: this attempt has epoch 4, the run now belongs to epoch 5; leaving"
+    assert (node.exit_code, node.words) == (3, output)
     assert status_of(bench.new_engine(), handle) == [node], "a later controller knows it, too"
 
 

@@ -84,11 +84,11 @@ def test_a_scrape_reports_waiting_running_and_ended_jobs_and_their_use(small: Se
     assert (value(after, "muster_scheduling_pass_seconds_count") or 0) >= 2
 
     # what the dashboard shows is there; steps a second only while something trains
-    there = {name for found in (during, after) for name, _ in found}
-    assert asked_by_the_dashboard() - there == {"muster_training_steps_per_second"}
+    existing = {name for found in (during, after) for name, _ in found}
+    assert dashboard_requests() - existing == {"muster_training_steps_per_second"}
 
 
-def asked_by_the_dashboard() -> set[str]:
+def dashboard_requests() -> set[str]:
     dashboard = json.loads((REPOSITORY / "containers/grafana.json").read_text())
     expressions = [target["expr"] for panel in dashboard["panels"] for target in panel["targets"]]
     return {name for expression in expressions for name in re.findall(r"muster_\w+", expression)}

@@ -49,14 +49,14 @@ def nodes_as_json(url: str) -> dict[tuple[str, int], list[dict[str, Any]]]:
 
 
 def test_every_node_is_a_row_that_says_what_the_json_held(old: str) -> None:
-    told = nodes_as_json(old)
+    reported = nodes_as_json(old)
     lift_whole(old)
     database = Database(old)
     with database.session() as session:
         attempts = session.scalars(select(Attempt)).all()
-        assert {(each.job_id, each.number): [node.shown() for node in each.nodes] for each in attempts} == told
+        assert {(each.job_id, each.number): [node.shown() for node in each.nodes] for each in attempts} == reported
         assert {each.compute_environment for each in attempts} == {"local"}
-        assert len(told) == 7 and sum(len(nodes) for nodes in told.values()) == 11
+        assert len(reported) == 7 and sum(len(nodes) for nodes in reported.values()) == 11
         main = session.scalars(select(Job).where(Job.name == "failed")).one().attempts[0].nodes[0]
         assert main.placement == Placement("localhost", (), 0.1, 16)
         assert (main.exit_code, main.error, main.met) == (1, 'RuntimeError: it\'s "over"', True)
@@ -91,8 +91,8 @@ def test_queues_keep_their_compute_environments_in_order(old: str) -> None:
     ],
 )
 def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old: str, damaged: str) -> None:
-    told = {"gpus": ["GPU-a", "GPU-b"], "devices": ["7"], "exitCode": 1, "reason": "a\0b\ud800"}
-    kept = [{"index": 0, "host": "h", **told}, {"index": 1, "host": "h"}]
+    reported = {"gpus": ["GPU-a", "GPU-b"], "devices": ["7"], "exitCode": 1, "reason": "a\0b\ud800"}
+    kept = [{"index": 0, "host": "h", **reported}, {"index": 1, "host": "h"}]
     written = {1: json.dumps(kept), 2: damaged}
     with connected(old) as connection:
         which = "WHERE number = :number AND job_id = (SELECT id FROM jobs WHERE name = 'failed')"
@@ -129,8 +129,8 @@ def test_jobs_in_every_state_continue_where_the_older_controller_left_them(old: 
         lost, again = detail(client, jobs["running"])["attempts"]
         assert (lost["ending"], again["ending"]) == ("failed", "succeeded"), "its processes were gone"
         assert [node["exitCode"] for node in again["nodes"]] == [0, 0]
-        [begun] = detail(client, jobs["starting"])["attempts"]
-        assert begun["ending"] == "succeeded", "the attempt that was recorded, launched now"
+        [started] = detail(client, jobs["starting"])["attempts"]
+        assert started["ending"] == "succeeded", "the attempt that was recorded, launched now"
         over = [detail(client, jobs[name])["status"] for name in ("done", "failed", "array")]
         assert over == ["SUCCEEDED", "FAILED", "SUCCEEDED"]
         [done] = detail(client, jobs["done"])["attempts"]

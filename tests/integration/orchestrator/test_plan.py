@@ -34,9 +34,9 @@ def test_a_plan_shows_every_node_and_nothing_is_registered_or_started(shared_ser
     assert len(lines) == 5 and all("python -P -m worker.train" in line for line in lines[2:])
     plan = json.loads(shared_server.muster("submit", SPEC, "--dry-run", "--json", "--set", "resources.cpus=0.1").stdout)
     assert [node["rank"] for node in plan["nodes"]] == [0, 1, 2]
-    told = plan["nodes"][1]["environment"]
-    assert told["MASTER_ADDR"] == plan["nodes"][0]["address"] != plan["nodes"][1]["address"]
-    assert (told["AWS_BATCH_JOB_NODE_INDEX"], told["NNODES"]) == ("1", "3")
+    reported = plan["nodes"][1]["environment"]
+    assert reported["MASTER_ADDR"] == plan["nodes"][0]["address"] != plan["nodes"][1]["address"]
+    assert (reported["AWS_BATCH_JOB_NODE_INDEX"], reported["NNODES"]) == ("1", "3")
     assert plan["registerJobDefinition"]["nodeProperties"]["numNodes"] == 3
     named = plan["registerJobDefinition"]["jobDefinitionName"]
     assert shared_server.client.batch("DescribeJobDefinitions", jobDefinitionName=named)["jobDefinitions"] == []
@@ -52,10 +52,10 @@ def test_the_whole_command_is_printed_on_any_width_of_terminal(shared_server: Se
 
 
 def test_a_plan_has_the_same_input_as_a_submission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan, given = LocalEngine.plan, []
+    plan, supplied = LocalEngine.plan, []
 
     def noted(engine: LocalEngine, gang: Gang) -> Plan[Any]:
-        given.append(gang)
+        supplied.append(gang)
         return plan(engine, gang)
 
     monkeypatch.setattr(LocalEngine, "plan", noted)
@@ -65,8 +65,8 @@ def test_a_plan_has_the_same_input_as_a_submission(tmp_path: Path, monkeypatch: 
         client.post("/api/plan", {"definition": compile_definition(spec, "/nowhere")})
         client.batch("RegisterJobDefinition", **compile_definition(spec, "/nowhere"))
         client.batch("SubmitJob", **submission_of(spec, "same"))
-        wait_for(lambda: len(given) == 2, 30, "the launch")
-    planned, submitted = given
+        wait_for(lambda: len(supplied) == 2, 30, "the launch")
+    planned, submitted = supplied
     assert (planned.priority, planned.stall_timeout, planned.timeout) == (7, 180.0, 3600)
     assert planned.bus == submitted.bus and planned.bus_token == "…", "the password is not for who only looks"
     own = ("job", "run", "bus_token")
@@ -116,7 +116,7 @@ def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment
             client.batch("CreateComputeEnvironment", computeEnvironmentName=name, **facts)
             order = [{"order": 1, "computeEnvironment": name}]
             client.batch("CreateJobQueue", jobQueueName=name, priority=1, computeEnvironmentOrder=order)
-        for name, said in refusals.items():
+        for name, output in refusals.items():
             spec = validate({**document, "queue": name}, "job.yaml")
             run = {"run": f"fits-{name}", "spec": {**document, "queue": name}}
             write_json(inside.store.run(f"fits-{name}").path / "run.json", run)
@@ -124,10 +124,10 @@ def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment
                 submit_spec(client, spec, "job.yaml")
             with pytest.raises(ApiError) as planned:
                 client.post("/api/plan", {"definition": compile_definition(spec, "/"), "queue": name})
-            assert said in str(submitted.value) and said in str(planned.value)
+            assert output in str(submitted.value) and output in str(planned.value)
             with pytest.raises(ApiError) as resumed:
                 client.post(f"/api/runs/fits-{name}/resume", {})
-            assert said in str(resumed.value) or "Job queue nowhere does not exist" in str(resumed.value)
+            assert output in str(resumed.value) or "Job queue nowhere does not exist" in str(resumed.value)
         assert client.batch("DescribeJobDefinitions", jobDefinitionName="fits")["jobDefinitions"] == []
         elastic = compile_definition(validate({**document, "nodes": {"min": 1, "max": 3}}, "job.yaml"), "/")
         plan = client.post("/api/plan", {"definition": elastic, "queue": "small"})
@@ -145,11 +145,11 @@ def test_an_option_of_an_engine_that_is_misspelt_is_refused_when_the_tag_is_made
     with Client(inside.url) as client:
         tags = {"muster:engine": "slurm", "muster:partiton": "gpu"}
         slurm = {"computeEnvironmentName": "cluster", "type": "UNMANAGED"}
-        said = refused("CreateComputeEnvironment", **slurm, tags=tags)
-        assert "muster:partiton: a compute environment of the slurm engine has no such option" in said
-        assert "; did you mean part" in said
-        said = refused("CreateComputeEnvironment", **slurm, tags={"muster:engine": "slrum"})
-        assert "no such engine; did you mean slurm?" in said
+        output = refused("CreateComputeEnvironment", **slurm, tags=tags)
+        assert "muster:partiton: a compute environment of the slurm engine has no such option" in output
+        assert "; did you mean part" in output
+        output = refused("CreateComputeEnvironment", **slurm, tags={"muster:engine": "slrum"})
+        assert "no such engine; did you mean slurm?" in output
         client.batch("CreateComputeEnvironment", **slurm, tags={"muster:engine": "slurm", "muster:partition": "gpu"})
         tagged = refused("TagResource", resourceArn=f"{arn}compute-environment/cluster", tags={"muster:nice": "low"})
         assert "tag muster:nice is 'low', not an integer" in tagged

@@ -53,8 +53,10 @@ def run_of(server: Serving) -> str:
 
 def test_its_command_route_and_page_are_there(server: Serving) -> None:
     run = run_of(server)
-    told = run_muster("notes", run, "walks sideways", home=server.home)
-    assert (told.returncode, told.stdout.split()) == (0, ["RUN", "NOTES", run, "walks", "sideways"]), told.stderr
+    reported = run_muster("notes", run, "walks sideways", home=server.home)
+    assert (reported.returncode, reported.stdout.split()) == (0, ["RUN", "NOTES", run, "walks", "sideways"]), (
+        reported.stderr
+    )
     assert "Print the notes on all runs or on one, or add one." in run_muster("--help", home=server.home).stdout
     assert server.client.get("/api/notes") == [{"run": run, "notes": ["walks sideways"]}]
     page = httpx.get(f"{server.url}/notes", headers={"accept": "text/html"})
@@ -149,8 +151,8 @@ task = find_task("ShortCartpole")
 print(json.dumps([task.__name__, load(plugins()["notes"].bundle_parts)(task.__new__(task))]))
 """
     env = {**os.environ, "PYTHONPATH": str(installed)}
-    told = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
-    assert json.loads(told.splitlines()[-1]) == ["ShortCartpole", {"notes.json": {"task": "ShortCartpole"}}]
+    reported = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True, check=True).stdout
+    assert json.loads(reported.splitlines()[-1]) == ["ShortCartpole", {"notes.json": {"task": "ShortCartpole"}}]
 
 
 def test_a_controller_that_started_before_the_plug_in_was_installed_is_to_be_started_again(

@@ -83,9 +83,12 @@ def test_a_route_that_no_permission_could_guard_is_refused(server: Server, folde
     install(folder, "", code)
     app = create_app(server.controller)
     add_console(app)
-    said = refusal(add_plugins, app, error=PluginError)
+    output = refusal(add_plugins, app, error=PluginError)
     place = "pages" if code.startswith("pages") else "router"
-    assert said.startswith(f"plug-in tally: tally_parts:{place}: {KINDS[code]}") and "no permission could guard" in said
+    assert (
+        output.startswith(f"plug-in tally: tally_parts:{place}: {KINDS[code]}")
+        and "no permission could guard" in output
+    )
 
 
 @pytest.mark.parametrize(
@@ -156,8 +159,8 @@ pages.post("/tally")(answer)
 
 def test_a_controller_that_can_t_add_a_plug_in_leaves_its_home_to_the_next(folder: Path, tmp_path: Path) -> None:
     install(folder, "", "router.add_route('/raw', raw)")
-    said = refusal(Server, tmp_path / "home", cpus=1, error=ServerError)
-    assert said.startswith("plug-in tally: tally_parts:router: /api/raw is a Route")
+    output = refusal(Server, tmp_path / "home", cpus=1, error=ServerError)
+    assert output.startswith("plug-in tally: tally_parts:router: /api/raw is a Route")
     for each in (*folder.glob("tally*.py"), folder / "tally-1.0.dist-info" / "entry_points.txt"):
         each.unlink()
     forget()

@@ -112,8 +112,8 @@ def test_a_bug_of_an_engine_holds_up_one_job_logged_once(
     wait_for(lambda: bench.engine.tries[call] > 1, 30, "another try")
     bench.runs_and_ends("good-2")
     tries, passed = bench.engine.tries[call], time.monotonic() - began
-    told = f"{tries} tries within {passed:.1f} s: each pause doubles, from one second on"
-    assert 2 ** (tries - 1) - 1 <= passed, told
+    reported = f"{tries} tries within {passed:.1f} s: each pause doubles, from one second on"
+    assert 2 ** (tries - 1) - 1 <= passed, reported
     tracebacks = [record for record in caplog.records if record.exc_info]
     assert len(tracebacks) == 1 and GOES_WRONG[call] in tracebacks[0].getMessage(), caplog.text
     assert bench.job("bad").status in (Status.STARTING, Status.RUNNING)
@@ -291,7 +291,7 @@ def test_a_stop_does_not_wait_for_outcomes_that_can_not_be_read(bench: Bench) ->
     bench.wait("a", Status.RUNNING)
     runs, answered = bench.controller.attempts.runs, threading.Event()
     outcomes = runs.outcomes
-    runs.outcomes = lambda *asked: (answered.wait(60), outcomes(*asked))[1]  # type: ignore[method-assign]
+    runs.outcomes = lambda *requested: (answered.wait(60), outcomes(*requested))[1]  # type: ignore[method-assign]
     bench.engine.cluster.end("a/1/1", 1, 0)
     with bench.database.session() as session:
         session.get_one(Job, "a").stop_reason = "enough"

@@ -41,12 +41,12 @@ class Talk:
         self.client = Client(server.url)
         self.job = submit_gang(self.client, SAYS.format(path=str(path)), 2)
         self.threads: list[threading.Thread] = []
-        self.said: list[str] = []
+        self.output: list[str] = []
 
     def say(self, *texts: str) -> None:
         with open(self.path, "a") as file:
             file.writelines(f"{text}\n" for text in texts)
-        self.said += texts
+        self.output += texts
 
     def follow(self) -> list[str]:
         """The texts that a new follower gets, which grow."""
@@ -64,12 +64,12 @@ class Talk:
         return all([each for each in texts if each.startswith(f"{node}:")] == self._of(node) for node in range(2))
 
     def _of(self, node: int) -> list[str]:
-        return [f"{node}:{text}" for text in self.said]
+        return [f"{node}:{text}" for text in self.output]
 
     def is_pushed(self) -> bool:
         """Whether the nodes push all that they print, and nobody looks at a file."""
         followed = self.server.controller.logs._followed.get(self.job)
-        return followed is not None and followed.logs.delivers() and not followed.is_looked_at
+        return followed is not None and followed.logs.delivers() and not followed.is_polled
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_lines_come_by_push_alone_while_the_bus_delivers(talk: Talk, monkeypatch
     looks: list[Any] = []
     genuine: Callable[..., Any] = log_tail.read_log
     for module in (log_tail, log_files):
-        monkeypatch.setattr(module, "read_log", lambda *given: (looks.append(given), genuine(*given))[1])
+        monkeypatch.setattr(module, "read_log", lambda *supplied: (looks.append(supplied), genuine(*supplied))[1])
     monkeypatch.setattr(log_tail, "FRESH", 3600.0)  # the machine may be busy for longer than the node's word counts
     for number in range(30):
         talk.say(f"line {number}")

@@ -39,7 +39,7 @@ def runs_of(server: Serving) -> list[str]:
     return sorted(os.listdir(server.home / "store" / "runs"))
 
 
-def said(server: Serving, *arguments: str) -> str:
+def output(server: Serving, *arguments: str) -> str:
     done = server.muster(*arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
@@ -57,27 +57,27 @@ def test_what_jobs_of_the_batch_api_leave_goes_without_a_trace_but_what_they_mad
         server.wait(each, "SUCCEEDED")
     kept = server.detail(maker)["run"]
     assert len(runs_of(server)) == 5
-    plan = said(server, "gc", "--dry-run", "--older-than", "0m")
+    plan = output(server, "gc", "--dry-run", "--older-than", "0m")
     assert "would delete 6 jobs and 4 runs" in plan and f"kept: run {kept}: it holds mine.csv" in plan
-    assert said(server, "gc", "--dry-run").startswith("would delete 0 jobs"), "they are young"
+    assert output(server, "gc", "--dry-run").startswith("would delete 0 jobs"), "they are young"
     assert len(runs_of(server)) == 5
-    taken = json.loads(said(server, "gc", "--older-than", "0m", "--json"))
+    taken = json.loads(output(server, "gc", "--older-than", "0m", "--json"))
     assert sum(len(each["jobs"]) for each in taken["runs"]) == 6
     assert runs_of(server) == [kept] and os.listdir(server.home / "store" / "trash") == []
     assert sorted(os.listdir(server.home / "store" / "runs" / kept / "logs")) == []
     for each in (gang, array, f"{array}:1", maker):
         with pytest.raises(ApiError, match="does not exist"):
             server.detail(each)
-    nothing = said(server, "gc", "--older-than", "0m")
+    nothing = output(server, "gc", "--older-than", "0m")
     assert nothing.startswith("deleted 0 jobs") and "no job of yours is old enough" in nothing
 
 
 def test_an_archived_run_is_kept_out_of_lists_and_nothing_is_added_to_it(server: Serving) -> None:
     job = server.gang("print('here')", name="archived")
     run = server.wait(job, "SUCCEEDED")["run"]
-    assert run in said(server, "runs", "list")
-    assert "is archived" in said(server, "runs", "archive", run)
-    assert run not in said(server, "runs", "list") and run in said(server, "runs", "list", "--archived")
+    assert run in output(server, "runs", "list")
+    assert "is archived" in output(server, "runs", "archive", run)
+    assert run not in output(server, "runs", "list") and run in output(server, "runs", "list", "--archived")
     assert server.client.get(f"/api/runs/{run}")["archived"] is True
     again = multinode("again", container(["true"], env={"MUSTER_RUN": run}))
     server.client.batch("RegisterJobDefinition", **again)
@@ -85,14 +85,14 @@ def test_an_archived_run_is_kept_out_of_lists_and_nothing_is_added_to_it(server:
         server.client.batch("SubmitJob", jobName="again", jobQueue="default", jobDefinition="again")
     with pytest.raises(ApiError, match="is archived"):
         server.client.post(f"/api/runs/{run}/resume", {})
-    plan = said(server, "gc", "--dry-run", "--older-than", "0m")
+    plan = output(server, "gc", "--dry-run", "--older-than", "0m")
     assert f"kept: run {run}: it is archived" in plan
     refused(["runs", "delete", run, "--yes"], server.home, 1, f"run {run} is kept: it is archived")
-    said(server, "runs", "archive", run, "--undo")
+    output(server, "runs", "archive", run, "--undo")
     refused(["runs", "delete", run], server.home, 2, "add --yes")
-    assert f"deleted run {run}: " in said(server, "runs", "delete", run, "--yes")
+    assert f"deleted run {run}: " in output(server, "runs", "delete", run, "--yes")
     assert run not in runs_of(server) and server.detail(job)["status"] == "SUCCEEDED"
-    shown = said(server, "show", job)
+    shown = output(server, "show", job)
     assert f"{run} (deleted, with its logs)" in shown and "node-0.log" not in shown
     assert f"run {run} was deleted, and the log of job {job} with it" in server.muster("logs", job).stderr
     refused(["runs", "delete", run, "--yes"], server.home, 2, f"run {run} does not exist")
@@ -140,10 +140,10 @@ def test_rules_are_checked_where_they_are_set(server: Serving) -> None:
     try:
         job = server.gang("print('here')", name="young")
         server.wait(job)
-        assert said(server, "gc", "--older-than", "0m").startswith("deleted 0 jobs"), "the queue's rule goes first"
+        assert output(server, "gc", "--older-than", "0m").startswith("deleted 0 jobs"), "the queue's rule goes first"
     finally:
         assert set_tag("0.001m").status_code == 200
-    said(server, "gc")
+    output(server, "gc")
     with pytest.raises(ApiError, match="does not exist"):
         server.detail(job)
     httpx.delete(f"{server.url}/v1/tags/{queue}", params={"tagKeys": "muster:retention"}).raise_for_status()
@@ -307,7 +307,7 @@ def test_a_volume_that_fails_is_answered_in_one_line(
     def fail(*_: object) -> None:
         raise OSError(errno.EIO, "Input/output error", "/volume")
 
-    for module, name in ((trash, "throw_away"), (contents, "archive"), (contents, "unarchive")):
+    for module, name in ((trash, "discard"), (contents, "archive"), (contents, "unarchive")):
         monkeypatch.setattr(module, name, fail)
     for answer in (
         http.delete(f"/api/runs/{trained}"),

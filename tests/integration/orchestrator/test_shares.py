@@ -51,8 +51,8 @@ class Lab:
 
     def submit(self, who: str, queue: str = "fair", **request: Any) -> str | None:
         """Submit a job; the share that it has got."""
-        asked = {"jobName": "j", "jobQueue": queue, "jobDefinition": self.definition, **request}
-        return self.share_of(self.clients[who].batch("SubmitJob", **asked)["jobId"])
+        requested = {"jobName": "j", "jobQueue": queue, "jobDefinition": self.definition, **request}
+        return self.share_of(self.clients[who].batch("SubmitJob", **requested)["jobId"])
 
     def spec(self, who: str, **changes: Any) -> str | None:
         """The same from a spec."""

@@ -80,15 +80,15 @@ def test_an_array_stores_its_definition_once_for_all_children(inside: Server, ht
     assert [(each["status"], each["statusReason"]) for each in ended] == [("FAILED", "enough")] * 2
 
 
-@pytest.mark.parametrize("said", OVERSIZED)
-def test_a_request_beyond_a_limit_is_refused_by_the_limits_name(http: httpx.Client, said: str) -> None:
-    operation, body = OVERSIZED[said]
+@pytest.mark.parametrize("output", OVERSIZED)
+def test_a_request_beyond_a_limit_is_refused_by_the_limits_name(http: httpx.Client, output: str) -> None:
+    operation, body = OVERSIZED[output]
     answer = http.post(f"/v1/{operation}", content=body)
-    assert answer.status_code == 400 and said in answer.json()["message"] and len(answer.text) < 500
+    assert answer.status_code == 400 and output in answer.json()["message"] and len(answer.text) < 500
     if operation == "listjobs":
         target = {"X-Amz-Target": "Logs_20140328.GetLogEvents", "Content-Type": "application/x-amz-json-1.1"}
         answer = http.post("/", content=body, headers=target)
-        assert answer.status_code == 400 and said in answer.json()["message"] and len(answer.text) < 500
+        assert answer.status_code == 400 and output in answer.json()["message"] and len(answer.text) < 500
 
 
 def test_metrics_come_in_pages_and_no_plan_is_longer_than_a_limit(inside: Server, http: httpx.Client) -> None:
@@ -135,7 +135,7 @@ def test_the_newest_streams_cost_one_statement_however_many_jobs_are_children_of
             child = {"parent": "array", "node_properties": None, "attempts": [attempt]}
             session.add(job(f"array:{index}", run=f"array-{index}", **child))
     statements: list[str] = []
-    event.listen(database.engine, "before_cursor_execute", lambda *given: statements.append(given[2]))
+    event.listen(database.engine, "before_cursor_execute", lambda *supplied: statements.append(supplied[2]))
     with database.session() as session:
         assert len(newest_streams(session, CONTROLLER, Store(tmp_path / "store"))) == 3
     assert len(statements) == 1, statements

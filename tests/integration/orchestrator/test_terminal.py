@@ -67,9 +67,9 @@ def test_errors_json_and_the_controllers_warnings_are_text(capsys: pytest.Captur
     echo_json({"name": HOSTILE})
     log_visibly()
     assert logging.lastResort is not None
-    said = logging.lastResort.format(logging.LogRecord("muster", logging.WARNING, "", 0, "job %s", (HOSTILE,), None))
+    output = logging.lastResort.format(logging.LogRecord("muster", logging.WARNING, "", 0, "job %s", (HOSTILE,), None))
     printed = capsys.readouterr()
-    assert printed.err == f"muster: {SHOWN}\n" and said == f"job {SHOWN}"
+    assert printed.err == f"muster: {SHOWN}\n" and output == f"job {SHOWN}"
     assert json.loads(printed.out) == {"name": HOSTILE} and printed.out.isprintable() is False
     assert set(printed.out) - {"\n"} <= set(map(chr, range(32, 127)))
 

@@ -58,12 +58,12 @@ def test_a_damaged_row_is_named_once_and_stops_no_other_job(home: Path, caplog: 
         wait_for(lambda: "each node needs 64 CPUs" in detail(client, waiting)["statusReason"], 30, "that it waits")
     [[kept]] = change(home, "SELECT node_properties FROM jobs WHERE id = ?", running)
     change(home, "UPDATE jobs SET node_properties = '{broken' WHERE id IN (?, ?)", running, waiting)
-    said = "the controller failed on this job (ValueError: nodeProperties are empty: the job's row in the database is damaged)"
+    output = "the controller failed on this job (ValueError: nodeProperties are empty: the job's row in the database is damaged)"
     with serving(home) as client:
-        reason = wait_for(lambda: said in (r := status_reason(home, running)) and r, 30, "the reason")
-        assert reason == f"{said}; trying again"
+        reason = wait_for(lambda: output in (r := status_reason(home, running)) and r, 30, "the reason")
+        assert reason == f"{output}; trying again"
         await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
-        wait_for(lambda: said in status_reason(home, waiting), 30, "the reason")
+        wait_for(lambda: output in status_reason(home, waiting), 30, "the reason")
         change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", kept, running)
         client.batch("TerminateJob", jobId=running, reason="enough")
         assert await_status(client, running, "FAILED")["statusReason"] == "enough"
@@ -88,12 +88,12 @@ def test_a_damaged_row_harms_no_other(inside: Server, http: httpx.Client, ended:
     broken, whole = ended
     home = Path(str(inside.controller.database.volume))
     [[kept]] = change(home, "SELECT node_properties FROM jobs WHERE id = ?", broken)
-    asked = {"jobQueue": "default", "filters": [{"name": "AFTER_CREATED_AT", "values": ["0"]}]}
+    requested = {"jobQueue": "default", "filters": [{"name": "AFTER_CREATED_AT", "values": ["0"]}]}
     run = http.get(f"/api/jobs/{broken}").json()["run"]
     before = http.post("/v1/describejobs", json={"jobs": [whole]}).json()["jobs"]
     change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", value, broken)
     try:
-        answer = http.post("/v1/listjobs", json=asked)
+        answer = http.post("/v1/listjobs", json=requested)
         assert answer.status_code == 200, answer.text
         listed = {each["jobId"]: each for each in answer.json()["jobSummaryList"]}
         described = http.post("/v1/describejobs", json={"jobs": [broken, f"{broken}#0", whole]}).json()["jobs"]
@@ -108,8 +108,8 @@ def test_a_damaged_row_harms_no_other(inside: Server, http: httpx.Client, ended:
         pages.append(http.post("/v1/listjobs", json={"multiNodeJobId": broken, "jobStatus": "SUCCEEDED"}))
         pages.append(http.get(f"/api/jobs/{broken}/logs"))
         for page in pages:
-            said = f"job broken ({broken[:8]}): the job's row in the database is damaged; submit the job again"
-            assert (page.status_code, page.json()["message"]) == (409, said)
+            output = f"job broken ({broken[:8]}): the job's row in the database is damaged; submit the job again"
+            assert (page.status_code, page.json()["message"]) == (409, output)
         assert all(http.get(f"/api/{path}").status_code == 200 for path in (f"jobs/{whole}", "runs", f"runs/{run}"))
         change(home, "UPDATE jobs SET node_properties = ? WHERE id = ?", kept, broken)
         [[definition]] = change(home, "SELECT definition FROM jobs WHERE id = ?", broken)
@@ -133,43 +133,43 @@ def test_a_start_that_fails_stops_no_other_and_is_tried_again(home: Path, caplog
         blocked.parent.mkdir(exist_ok=True)
         blocked.write_text("a file where the run's directory belongs")
         first = submit_gang(client, "print('here')", env={"MUSTER_RUN": "blocked"})
-        said = f"store {home / 'store'}: can't read run blocked now ([Errno 20] Not a directory"
-        wait_for(lambda: status_reason(home, first).startswith(said), 30, "the reason")
+        output = f"store {home / 'store'}: can't read run blocked now ([Errno 20] Not a directory"
+        wait_for(lambda: status_reason(home, first).startswith(output), 30, "the reason")
         await_status(client, submit_gang(client, "print('here')", cpus="2"), "SUCCEEDED")
         blocked.unlink()
         done = await_status(client, first, "SUCCEEDED", "FAILED")
         assert (done["status"], len(done["attempts"])) == ("SUCCEEDED", 1), done["statusReason"]
-    [told] = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
-    assert told.startswith(f"job {first}: {said}")
+    [reported] = [record.getMessage() for record in caplog.records if record.levelname == "ERROR"]
+    assert reported.startswith(f"job {first}: {output}")
 
 
 @pytest.mark.parametrize("how", ["moved away", "replaced"])
 def test_without_its_database_a_controller_accepts_nothing(
     home: Path, caplog: pytest.LogCaptureFixture, how: str
 ) -> None:
-    database, away = home / "muster.db", home / "away.db"
+    database, absent = home / "muster.db", home / "away.db"
     with serving(home) as client:
         url = str(client._http.base_url)
         running = submit_gang(client, FOREVER)
         await_status(client, running, "RUNNING")
         before = processes_of(home)
-        database.rename(away)
-        said = f"database {database} was deleted while the controller runs; put that file back"
+        database.rename(absent)
+        output = f"database {database} was deleted while the controller runs; put that file back"
         if how == "replaced":
-            shutil.copy(away, database)
-            said = (
+            shutil.copy(absent, database)
+            output = (
                 f"database {database} was replaced by another file while the controller runs; put the former one back, "
             )
-            said += "or restart the controller to use this one"
+            output += "or restart the controller to use this one"
         health = wait_for(lambda: (h := httpx.get(f"{url}/healthz")).is_error and h, 10, "that the loop has noticed")
-        assert (health.status_code, health.json()["message"]) == (503, said)
-        with pytest.raises(ApiError, match=re.escape(said)):
+        assert (health.status_code, health.json()["message"]) == (503, output)
+        with pytest.raises(ApiError, match=re.escape(output)):
             Client.connect(url, serving=True)
         for ask in (lambda: submit_gang(client, "pass"), lambda: detail(client, running)):
             with pytest.raises(ApiError) as refused:
                 ask()
-            assert (refused.value.status, str(refused.value).count(said)) == (503, 1), refused.value
-        wait_for(lambda: any(said in record.getMessage() for record in caplog.records), 30, "a line in the log")
+            assert (refused.value.status, str(refused.value).count(output)) == (503, 1), refused.value
+        wait_for(lambda: any(output in record.getMessage() for record in caplog.records), 30, "a line in the log")
         waited: list[str] = []
         follower = Client(url)
         follower.notify = waited.append
@@ -178,7 +178,7 @@ def test_without_its_database_a_controller_accepts_nothing(
         wait_for(lambda: waited, 30, "a follower waits")
         assert how == "replaced" or not database.exists(), "no empty file was made in its place"
         assert set(before) <= set(processes_of(home))
-        away.rename(database)
+        absent.rename(database)
         wait_for(lambda: httpx.get(f"{url}/healthz").status_code == 200, 30, "that it serves again")
         await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
         assert detail(client, running)["status"] == "RUNNING" and set(before) <= set(processes_of(home))
@@ -187,7 +187,7 @@ def test_without_its_database_a_controller_accepts_nothing(
         await_status(client, running, "FAILED")
         following.join(60)
         assert not following.is_alive()
-    assert sum(said in record.getMessage() for record in caplog.records) == 1
+    assert sum(output in record.getMessage() for record in caplog.records) == 1
 
 
 def test_gangs_of_a_deleted_database_are_named_at_the_next_start(home: Path, caplog: pytest.LogCaptureFixture) -> None:

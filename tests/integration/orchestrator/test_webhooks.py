@@ -43,7 +43,7 @@ def receiver(listening: Receiver) -> Receiver:
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory: pytest.TempPathFactory, listening: Receiver) -> Iterator[Serving]:
+def reported(tmp_path_factory: pytest.TempPathFactory, listening: Receiver) -> Iterator[Serving]:
     """A controller that tells the receiver of every end."""
     home = tmp_path_factory.mktemp("told")
     file = write_webhooks(home / "hooks.json", chat={"url": listening.url, "link": "https://muster.example/"})
@@ -60,20 +60,20 @@ def is_signed(headers: dict[str, str], body: bytes) -> bool:
     return headers["webhook-signature"] == f"v1,{expected}"
 
 
-def test_the_receiver_is_told_of_each_end_once_and_the_message_is_signed(told: Serving, receiver: Receiver) -> None:
-    good, bad = told.gang("print(1)", name="good"), told.gang("raise SystemExit(3)", name="bad")
-    stopped = told.gang("import time; time.sleep(3600)", name="stopped")
-    told.wait(stopped, "RUNNING")
-    told.client.batch("TerminateJob", jobId=stopped, reason="enough")
+def test_the_receiver_is_told_of_each_end_once_and_the_message_is_signed(reported: Serving, receiver: Receiver) -> None:
+    good, bad = reported.gang("print(1)", name="good"), reported.gang("raise SystemExit(3)", name="bad")
+    stopped = reported.gang("import time; time.sleep(3600)", name="stopped")
+    reported.wait(stopped, "RUNNING")
+    reported.client.batch("TerminateJob", jobId=stopped, reason="enough")
     for job in (good, bad, stopped):
-        told.wait(job)
-    wait_for(lambda: told.client.get("/api/webhooks")[0]["waiting"] == 0, 20, "all delivered")
+        reported.wait(job)
+    wait_for(lambda: reported.client.get("/api/webhooks")[0]["waiting"] == 0, 20, "all delivered")
     assert len(receiver.messages) == 3, "none of them twice"
     for job, kind, code in ((good, "job.succeeded", 0), (bad, "job.failed", 3), (stopped, "job.failed", None)):
         ((headers, body),) = receiver.of(job)
         assert is_signed(headers, body) and headers["content-type"] == "application/json"
         message = json.loads(body)
-        data, detail = message["data"], told.detail(job)
+        data, detail = message["data"], reported.detail(job)
         ended = (kind, detail["status"], detail["statusReason"])
         assert (message["type"], data["status"], data["statusReason"]) == ended
         assert (data["name"], data["run"], data["queue"]) == (detail["name"], detail["run"], "default")
@@ -83,32 +83,32 @@ def test_the_receiver_is_told_of_each_end_once_and_the_message_is_signed(told: S
         assert message["timestamp"] == data["stoppedAt"] > data["startedAt"] >= data["createdAt"]
 
 
-def test_a_message_is_tried_again_by_the_next_controller_unchanged(told: Serving, receiver: Receiver) -> None:
+def test_a_message_is_tried_again_by_the_next_controller_unchanged(reported: Serving, receiver: Receiver) -> None:
     receiver.answers = [500]
-    job = told.gang("print(1)")
+    job = reported.gang("print(1)")
     wait_for(lambda: receiver.of(job), 20, "a first try")
-    told.kill()
-    told.start()
+    reported.kill()
+    reported.start()
     wait_for(lambda: len(receiver.of(job)) == 2, 20, "a second try")
-    wait_for(lambda: told.client.get("/api/webhooks")[0]["waiting"] == 0, 20, "it is delivered")
+    wait_for(lambda: reported.client.get("/api/webhooks")[0]["waiting"] == 0, 20, "it is delivered")
     (first, body), (second, again) = receiver.of(job)
     assert first["webhook-id"] == second["webhook-id"] and body == again
     assert is_signed(first, body) and is_signed(second, again)
 
 
-def test_a_slow_or_unreachable_receiver_delays_no_job(told: Serving, receiver: Receiver) -> None:
+def test_a_slow_or_unreachable_receiver_delays_no_job(reported: Serving, receiver: Receiver) -> None:
     receiver.gate.clear()
-    first = told.gang("print(1)", name="first")
+    first = reported.gang("print(1)", name="first")
     wait_for(lambda: receiver.of(first), 20, "a message that is not answered")
     for name in ("second", "third"):
-        told.wait(told.gang("print(1)", name=name), "SUCCEEDED")
-    assert len(receiver.messages) == 1 and told.client.get("/api/webhooks")[0]["waiting"] == 3
+        reported.wait(reported.gang("print(1)", name=name), "SUCCEEDED")
+    assert len(receiver.messages) == 1 and reported.client.get("/api/webhooks")[0]["waiting"] == 3
     receiver.gate.set()
     wait_for(lambda: len(receiver.messages) == 3, 20, "the others")
 
 
-def test_the_command_lists_webhooks_without_secrets_and_sends_samples(told: Serving, receiver: Receiver) -> None:
-    command = partial(told.muster, "webhooks")
+def test_the_command_lists_webhooks_without_secrets_and_sends_samples(reported: Serving, receiver: Receiver) -> None:
+    command = partial(reported.muster, "webhooks")
     sent = command("test", "chat")
     ((headers, body),) = receiver.messages
     place = f"http://127.0.0.1:{receiver.server_port}"
@@ -132,8 +132,8 @@ def test_an_undeliverable_message_is_given_up(
 ) -> None:
     receiver.answers = [500, 503, 404]
     with receiving() as gone:
-        away = gone.url
-    file = write_webhooks(tmp_path / "hooks.json", chat={"url": receiver.url}, away={"url": away})
+        absent = gone.url
+    file = write_webhooks(tmp_path / "hooks.json", chat={"url": receiver.url}, absent={"url": absent})
     server = Server(tmp_path / "home", cpus=1, webhooks=file)
     server.deliveries._pauses = (0.05, 0.05)
     server.start()
@@ -176,8 +176,8 @@ def test_an_unknown_queue_is_named_with_the_nearest_one(tmp_path: Path, caplog: 
     server = Server(tmp_path / "home", cpus=1, webhooks=file)
     server.start()
     server.close()
-    told = [each.getMessage() for each in caplog.records if each.name == "muster.webhooks"]
-    assert told == ["webhook chat: there is no queue defualt now; did you mean default?"]
+    reported = [each.getMessage() for each in caplog.records if each.name == "muster.webhooks"]
+    assert reported == ["webhook chat: there is no queue defualt now; did you mean default?"]
 
 
 def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: Path) -> None:

@@ -56,9 +56,9 @@ class Running:
         env.pop("ROS_DOMAIN_ID", None)
         with log.open("w") as out:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=env)
-        wait_for(lambda: "node /muster_policy" in self.said(), 30, "the node")
+        wait_for(lambda: "node /muster_policy" in self.output(), 30, "the node")
 
-    def said(self) -> str:
+    def output(self) -> str:
         return self.log.read_text()
 
     def end(self) -> int:
@@ -90,11 +90,11 @@ def definition(kind: str) -> str:
 def test_another_implementation_of_the_wire_drives_the_node_and_hears_it(running: Running) -> None:
     """Joint states from the peer's publisher, commands at the peer's subscriber; each sees the other's tokens."""
     common = {"router_ip": "127.0.0.1", "router_port": running.port, "type_hash": MESSAGES.type_hash(JOINT_STATE)}
-    heard: list[Any] = []
+    received: list[Any] = []
     kind = {"msg_type": JOINT_STATE, "msg_definition": definition(JOINT_STATE)}
-    subscriber = ROS2Subscriber("/joint_commands", callback=heard.append, node_name="driver", **kind, **common)
+    subscriber = ROS2Subscriber("/joint_commands", callback=received.append, node_name="driver", **kind, **common)
     publisher = ROS2Publisher("/joint_states", node_name="sensors", **kind, **common)
-    wanted = {
+    requested = {
         ("NN", "/muster_policy", "", ""),
         ("MP", "/muster_policy", "/joint_commands", JOINT_STATE),
         ("MS", "/muster_policy", "/joint_states", JOINT_STATE),
@@ -110,7 +110,7 @@ def test_another_implementation_of_the_wire_drives_the_node_and_hears_it(running
                 tokens.update(str(reply.ok.key_expr) for reply in session.liveliness().get("@ros2_lv/**", timeout=5))
                 return {(each.kind, each.node, each.name, each.type) for each in map(parse_token, tokens) if each}
 
-            wait_for(lambda: wanted <= shown(), 10, "the tokens of all endpoints")
+            wait_for(lambda: requested <= shown(), 10, "the tokens of all endpoints")
         shapes = {re.sub(r"/[^/]*/\d+/\d+/", "/", key) for key in tokens if "%joint_" in key}
         ours, theirs = "/MS/%/%/muster_policy/%joint_states/", "/MS/%/%/driver/%joint_commands/"
         tails = [next(key.split(part)[1] for key in shapes if part in key) for part in (ours, theirs)]
@@ -121,10 +121,10 @@ def test_another_implementation_of_the_wire_drives_the_node_and_hears_it(running
             fields = ("header", "name", "position", "velocity", "effort")
             publisher.publish(**{name: getattr(message, name) for name in fields})
             time.sleep(0.02)
-            return bool(heard) and heard[-1].position.tolist() == [pytest.approx(0.3 + 0.5 * knee)]
+            return bool(received) and received[-1].position.tolist() == [pytest.approx(0.3 + 0.5 * knee)]
 
         wait_for(lambda: sent(0.4), 20, "a command that follows from the peer's joint state")
-        assert heard[-1].name == ["knee"] and len(heard[-1].velocity) == len(heard[-1].effort) == 0
+        assert received[-1].name == ["knee"] and len(received[-1].velocity) == len(received[-1].effort) == 0
         wait_for(lambda: sent(-0.8), 20, "a command that follows from the next one")
     finally:
         subscriber.close()
@@ -156,7 +156,7 @@ def test_another_implementation_of_the_wire_has_the_node_begin_a_fresh_episode(t
         with open_session(running.endpoint, None) as session:
             stranger = session.get(client.keyexpr, target=zenoh.QueryTarget.ALL_COMPLETE, timeout=5)
             assert list(stranger) == [], "a request without rmw_zenoh's attachment"
-        assert running.end() == 0 and " 2 resets," in running.said().splitlines()[-1], running.said()
+        assert running.end() == 0 and " 2 resets," in running.output().splitlines()[-1], running.output()
     finally:
         client.close()
         ZenohSession.get_instance().close()
@@ -206,15 +206,15 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
         kind = f"sensor_msgs::msg::dds_::JointState_/{MESSAGES.type_hash(JOINT_STATE)}"
         raw = session.declare_publisher(f"0/joint_states/{kind}")
 
-        def told() -> bool:
+        def reported() -> bool:
             wrong.publish(MESSAGES.twist((0.0,) * 3, (0.0,) * 3))
             raw.put(b"\0\1\0\0nonsense")
             time.sleep(0.05)
             right.publish(joint_state(0.0, ("wheel", "knee_motor")))
             time.sleep(0.05)
-            said = running.said()
+            output = running.output()
             return all(
-                line in said
+                line in output
                 for line in (
                     "/joint_states: message ignored: it is a geometry_msgs/msg/Twist, and the node reads sensor_msgs/msg/JointState",
                     "/joint_states: message ignored: 12 bytes that are no sensor_msgs/msg/JointState",
@@ -222,7 +222,7 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
                 )
             )
 
-        wait_for(told, 20, "a line for each")
+        wait_for(reported, 20, "a line for each")
         node.close()
     assert running.process.poll() is None
 
@@ -230,12 +230,12 @@ def test_wrong_messages_are_reported_in_a_line_and_the_node_survives_them(runnin
 def test_a_silent_robot_is_reported_a_reset_starts_an_episode_the_end_undeclares_all(
     running: Running,
 ) -> None:
-    wait_for(lambda: "/joint_states is silent for" in running.said(), 20, "the watchdog")
-    gone, there = threading.Event(), threading.Event()
+    wait_for(lambda: "/joint_states is silent for" in running.output(), 20, "the watchdog")
+    gone, existing = threading.Event(), threading.Event()
     with open_session(running.endpoint, None) as session:
         node = Node(session, MESSAGES, name="operator")
-        said: list[str] = []
-        log = lambda data, kind, type_hash: said.append(MESSAGES.decode(data, kind).msg)  # noqa: E731
+        output: list[str] = []
+        log = lambda data, kind, type_hash: output.append(MESSAGES.decode(data, kind).msg)  # noqa: E731
         node.subscribe("/rosout", "rcl_interfaces/msg/Log", log)
         diagnoses: list[Any] = []
         diagnose = lambda data, kind, type_hash: diagnoses.append(MESSAGES.decode(data, kind))  # noqa: E731
@@ -250,19 +250,19 @@ def test_a_silent_robot_is_reported_a_reset_starts_an_episode_the_end_undeclares
 
         wait_for(lambda: diagnosed(False), 20, "the end of what the tests before sent")
         wait_for(lambda: diagnosed(True), 20, "a diagnosis of the acting node")
-        wait_for(lambda: any("all inputs have arrived" in line for line in said), 20, "the line on /rosout")
+        wait_for(lambda: any("all inputs have arrived" in line for line in output), 20, "the line on /rosout")
         reset.publish(MESSAGES.make(EMPTY, structure_needs_at_least_one_member=0))
 
-        def told(sample: zenoh.Sample) -> None:
+        def reported(sample: zenoh.Sample) -> None:
             if "/NN/%/%/muster_policy" in str(sample.key_expr):
-                (gone if sample.kind == zenoh.SampleKind.DELETE else there).set()
+                (gone if sample.kind == zenoh.SampleKind.DELETE else existing).set()
 
-        ear = zenoh.handlers.Callback(told, indirect=False)
+        ear = zenoh.handlers.Callback(reported, indirect=False)
         session.liveliness().declare_subscriber("@ros2_lv/**", ear, history=True)
-        assert there.wait(30)
+        assert existing.wait(30)
         assert running.end() == 0
         assert gone.wait(10)
-        assert " 1 resets," in running.said().splitlines()[-1], running.said()
+        assert " 1 resets," in running.output().splitlines()[-1], running.output()
         node.close()
 
 
@@ -276,8 +276,8 @@ def test_a_taken_port_and_a_missing_router_are_reported_in_one_line(tmp_path: Pa
         options = ["--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}"]
         done = subprocess.run([*command, *options], env=env, capture_output=True, text=True, timeout=60)
     (line,) = done.stderr.strip().splitlines()
-    said = f"error: --listen {options[1]}: the port is taken; is a router or another node there?"
-    assert done.returncode == 1 and line.startswith(said), done.stderr
+    output = f"error: --listen {options[1]}: the port is taken; is a router or another node there?"
+    assert done.returncode == 1 and line.startswith(output), done.stderr
     nobody = ["--connect", f"tcp/127.0.0.1:{free_port()}", "--duration", "0.5"]
     done = subprocess.run([*command, *nobody], env=env, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0 and f"no router answers at {nobody[1]}; it is tried again" in done.stdout, done.stderr

@@ -28,8 +28,8 @@ from tests.support.worker.node import Node, Nodes
 def test_the_output_of_all_ranks_is_merged_with_rank_and_stream(node: Nodes) -> None:
     n = node(node_index=1, node_count=2, ranks_per_node=2)
     assert n.shell('echo "to out"; echo "to err" >&2') == 0
-    said = {(rank, *each) for rank in (2, 3) for each in (("e", "to err"), ("o", "to out"))}
-    assert set(n.lines()[:-1]) == said and len(n.lines()) == 5
+    output = {(rank, *each) for rank in (2, 3) for each in (("e", "to err"), ("o", "to out"))}
+    assert set(n.lines()[:-1]) == output and len(n.lines()) == 5
     assert n.lines()[-1] == (None, "o", "node 1 ended: done")
     outcome = n.ended()
     assert (outcome.node, outcome.epoch, outcome.exit_code, outcome.reason) == (1, 1, 0, "done")
@@ -202,7 +202,7 @@ BY_ENGINE = "a node is started by one of Muster's engines"
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "output"),
     [
         ({"EPOCH": ""}, "RUN/EPOCH: expected an integer of at most 15 digits, found ''"),
         ({"MUSTER_JOB_ID": None}, f"MUSTER_JOB_ID is missing; {BY_ENGINE}"),
@@ -216,7 +216,7 @@ BY_ENGINE = "a node is started by one of Muster's engines"
         ({"MUSTER_STORE": "/dev/null"}, "store: Not a directory: /dev/null/runs/run/EPOCH"),
     ],
 )
-def test_a_broken_contract_is_one_line(node: Nodes, tmp_path: Path, change: dict[str, str | None], said: str) -> None:
+def test_a_broken_contract_is_one_line(node: Nodes, tmp_path: Path, change: dict[str, str | None], output: str) -> None:
     n = node()
     for name, value in change.items():
         if value is None:
@@ -226,7 +226,7 @@ def test_a_broken_contract_is_one_line(node: Nodes, tmp_path: Path, change: dict
         else:
             n.environment[name] = value
     assert n.call("touch", str(tmp_path / "started")) == 2
-    assert n.stderr.read_text() == f"muster supervisor: {said.replace('RUN', str(n.run.path))}\n"
+    assert n.stderr.read_text() == f"muster supervisor: {output.replace('RUN', str(n.run.path))}\n"
     assert not (tmp_path / "started").exists()
 
 

@@ -41,7 +41,7 @@ def test_an_exception_is_reported_with_its_traceback(node: Nodes) -> None:
 
 
 @pytest.mark.parametrize(
-    ("said", "message"),
+    ("output", "message"),
     [
         ("echo first >&2; echo 'fatal: no such device' >&2; echo >&2; echo out", "fatal: no such device"),
         (
@@ -51,9 +51,11 @@ def test_an_exception_is_reported_with_its_traceback(node: Nodes) -> None:
         ("true", None),
     ],
 )
-def test_the_last_traceback_or_line_on_standard_error_is_the_error(node: Nodes, said: str, message: str | None) -> None:
+def test_the_last_traceback_or_line_on_standard_error_is_the_error(
+    node: Nodes, output: str, message: str | None
+) -> None:
     n = node()
-    assert n.shell(f"{said}; exit 9") == 9
+    assert n.shell(f"{output}; exit 9") == 9
     outcome = n.ended()
     assert outcome.reason == "rank 0 exited with code 9" + (f": {message}" if message else "")
     assert (outcome.error and outcome.error.message) == message
@@ -128,7 +130,7 @@ def test_an_unusable_error_file_costs_neither_the_exit_code_nor_time(node: Nodes
 
 def test_no_message_on_the_progress_pipe_ends_the_supervisor(node: Nodes) -> None:
     n = node(stall_timeout=600.0)
-    objects = ('{"iteration": []}', '{"iteration": 1e400}', '{"said": {"a": 1}}')
+    objects = ('{"iteration": []}', '{"iteration": 1e400}', '{"message": {"a": 1}}')
     lines = ["[1]", "1", "null", '"x"', "{", "[" * 50_000, *objects]
     script = (
         "import os, resource\nfd = int(os.environ['MUSTER_PROGRESS_FD'])\nos.set_blocking(fd, True)\n"
@@ -173,23 +175,23 @@ def test_a_rank_killed_by_a_signal_is_reported_by_the_signal_s_name(node: Nodes,
 
 
 def test_it_is_recorded_whether_a_node_was_asked_to_end_or_failed_by_itself(node: Nodes) -> None:
-    asked = node()
-    asked.start("sh", "-c", "echo ready; exec sleep 60")
-    asked.wait_for_output("ready")
-    asked.process.terminate()
-    assert (asked.wait(), asked.ended().asked) == (143, True)
-    assert asked.ended().reason == "rank 0 was killed by SIGTERM"
+    requested = node()
+    requested.start("sh", "-c", "echo ready; exec sleep 60")
+    requested.wait_for_output("ready")
+    requested.process.terminate()
+    assert (requested.wait(), requested.ended().requested) == (143, True)
+    assert requested.ended().reason == "rank 0 was killed by SIGTERM"
     well = node(attempt=4)
     well.start("sh", "-c", "trap 'exit 0' TERM; echo set; while :; do sleep 0.1; done")
     well.wait_for_output("set")
     well.process.terminate()
-    assert (well.wait(), well.ended().asked) == (0, True)
+    assert (well.wait(), well.ended().requested) == (0, True)
     failed = node(attempt=2)
-    assert (failed.shell("exit 3"), failed.ended().asked) == (3, False)
+    assert (failed.shell("exit 3"), failed.ended().requested) == (3, False)
     gang = node(attempt=3, ranks_per_node=3)
     assert gang.shell("if [ $RANK = 1 ]; then sleep 0.3; echo broken >&2; exit 3; fi; exec sleep 600") == 3
     ended = gang.ended()
-    assert (ended.reason, ended.error.rank, ended.asked) == ("rank 1 exited with code 3: broken", 1, False)
+    assert (ended.reason, ended.error.rank, ended.requested) == ("rank 1 exited with code 3: broken", 1, False)
 
 
 def test_a_rank_that_its_engine_ended_before_the_supervisor_knew_was_asked(node: Nodes) -> None:
@@ -200,7 +202,7 @@ def test_a_rank_that_its_engine_ended_before_the_supervisor_knew_was_asked(node:
     os.kill(int(n.output()[0]), signal.SIGTERM)
     n.process.terminate()
     n.process.send_signal(signal.SIGCONT)
-    assert (n.wait(), n.ended().asked) == (143, True)
+    assert (n.wait(), n.ended().requested) == (143, True)
 
 
 def test_a_rank_that_ignores_the_failure_of_another_is_killed(node: Nodes) -> None:
@@ -248,11 +250,11 @@ def test_a_rank_that_does_not_exit_within_the_grace_time_is_killed(node: Nodes) 
     n = node(grace=0.6)
     n.start("sh", "-c", STAYS)
     n.wait_for_output("ready")
-    asked = time.monotonic()
-    while n.process.poll() is None and time.monotonic() - asked < 10 * PATIENCE:
+    requested = time.monotonic()
+    while n.process.poll() is None and time.monotonic() - requested < 10 * PATIENCE:
         n.process.terminate()  # again and again, which does not prolong the grace
         time.sleep(0.1)
-    assert n.wait() == 137 and time.monotonic() - asked > 0.5
+    assert n.wait() == 137 and time.monotonic() - requested > 0.5
     outcome = n.ended()
     assert outcome.reason == "rank 0 did not leave within 0.6 s of SIGTERM and was killed"
     assert outcome.signal == "SIGKILL"
@@ -372,19 +374,19 @@ def test_who_is_asked_to_leave_before_the_outcome_stands_leaves_with_the_true_ex
 
 
 def test_while_the_store_is_away_the_node_waits_and_its_outcome_is_in_the_store_that_comes_back(tmp_path: Path) -> None:
-    store, away, go = tmp_path / "store", tmp_path / "away", tmp_path / "go"
+    store, absent, go = tmp_path / "store", tmp_path / "away", tmp_path / "go"
     n = Node(store)
     n.stderr = tmp_path / "stderr"
     n.start("sh", "-c", f"echo ready; while [ ! -e {go} ]; do sleep 0.05; done; exit 3")
     try:
         n.wait_for_output("ready")
-        store.rename(away)
+        store.rename(absent)
         store.mkdir()
         go.touch()
         wait_for(lambda: "trying again" in n.stderr.read_text(), 20, "a refused write")
         assert list(store.iterdir()) == []
         store.rmdir()
-        away.rename(store)
+        absent.rename(store)
         assert n.wait() == 3 and n.ended().exit_code == 3
     finally:
         n.process.kill()

@@ -35,8 +35,8 @@ def test_a_clone_trains_on_with_other_rewards_and_goes_on_when_it_is_killed(trai
         assert len(detail["attempts"]) == 2 and detail["results"]["parent"]["iteration"] == 1
         log = server.log(job)
 
-    begun = f"starting from the weights of {source.name}@1 (checkpoint {held.name}): 8 worlds"
-    assert sum(begun in each for each in log) == 1
+    started = f"starting from the weights of {source.name}@1 (checkpoint {held.name}): 8 worlds"
+    assert sum(started in each for each in log) == 1
     assert sum("resumed from checkpoint" in each for each in log) == 1
     assert (clone.parent / held.name / "learner.pt").read_bytes() == weights
     newest = list_checkpoints(clone)[-1]

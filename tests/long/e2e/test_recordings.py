@@ -73,11 +73,11 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         (world, "true", run.name) for world in sorted(each["world"] for each in facts)
     ]
     [used] = [each for each in list_checkpoints(run) if each.name == facts[0]["checkpoint"]]
-    told = attachments(file)
-    contract, model = json.loads(told["contract.json"]), onnx.load_from_string(told["policy.onnx"])
-    assert contract == used.manifest["contract"] and json.loads(told["job.json"])["train"]["task"] == "Cartpole"
+    reported = attachments(file)
+    contract, model = json.loads(reported["contract.json"]), onnx.load_from_string(reported["policy.onnx"])
+    assert contract == used.manifest["contract"] and json.loads(reported["job.json"])["train"]["task"] == "Cartpole"
     assert {each.key: each.value for each in model.metadata_props}["run_path"] == f"{run.name}/{used.name}"
-    assert set(told) == {"contract.json", "policy.onnx", "job.json", "robot.xml", "channels.json"}
+    assert set(reported) == {"contract.json", "policy.onnx", "job.json", "robot.xml", "channels.json"}
     while_training = attachments(live)
     assert json.loads(while_training["contract.json"]) == contract and "policy.onnx" not in while_training
     held = {each.iteration: each.manifest["files"]["learner.pt"]["sha256"] for each in list_checkpoints(run)}

@@ -39,17 +39,17 @@ class View:
             stderr=subprocess.STDOUT,
             text=True,
         )
-        self.said: list[str] = []
+        self.output: list[str] = []
         self.url = self.until("the view is at ").split()[-1]
 
     def until(self, words: str) -> str:
         """The next line that has these words."""
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            self.said.append(line)
+            self.output.append(line)
             if words in line:
                 return line
-        raise AssertionError(f"it ended without {words!r}: {self.said}")
+        raise AssertionError(f"it ended without {words!r}: {self.output}")
 
     @property
     def below(self) -> list[psutil.Process]:
@@ -67,7 +67,7 @@ class View:
         for each in self.below:
             each.send_signal(signal.SIGINT)
         assert self.process.stdout is not None
-        self.said += self.process.stdout.readlines()
+        self.output += self.process.stdout.readlines()
         return self.process.wait()
 
     def close(self) -> None:
@@ -125,8 +125,8 @@ def view(server: Serving, job: str) -> Iterator[View]:
 
 
 def rank_of(run: Run) -> psutil.Process:
-    told = wait_for(lambda: read_json(run.telemetry / "tap.json"), 60, "the training's answer")
-    return psutil.Process(told["process"])
+    reported = wait_for(lambda: read_json(run.telemetry / "tap.json"), 60, "the training's answer")
+    return psutil.Process(reported["process"])
 
 
 def test_frames_curve_and_log_of_a_training_arrive_at_20_hz_at_most(view: View, job: str, tmp_path: Path) -> None:
@@ -165,9 +165,9 @@ def test_a_training_has_one_reader_and_a_second_one_is_told_in_one_line(view: Vi
 
 
 def test_a_browser_shows_the_training_moving_and_asks_no_other_machine(view: View) -> None:
-    asked: set[str] = set()
+    requested: set[str] = set()
     with empty_page() as page:
-        page.on("request", lambda request: asked.add(request.url))
+        page.on("request", lambda request: requested.add(request.url))
         page.goto(view.url, timeout=120_000)
 
         def worlds() -> np.ndarray:
@@ -180,7 +180,7 @@ def test_a_browser_shows_the_training_moving_and_asks_no_other_machine(view: Vie
         wait_for(is_drawn, 120, "the carts on the screen")
         first = worlds()
         wait_for(lambda: (np.abs(worlds() - first).max(-1) > 40).sum() > 20, 120, "another frame")
-    hosts = {urllib.parse.urlsplit(url).hostname or "" for url in asked if not url.startswith(("data:", "blob:"))}
+    hosts = {urllib.parse.urlsplit(url).hostname or "" for url in requested if not url.startswith(("data:", "blob:"))}
     assert hosts and all(ipaddress.ip_address(host).is_loopback for host in hosts), hosts
 
 
@@ -208,7 +208,7 @@ def test_a_checkpoint_s_policy_acts_until_its_episodes_are_over(server: Serving,
     view = View(server, run.name, "--worlds", "1")
     try:
         tables = saved(view, tmp_path / "policy.rrd")
-        assert view.interrupt() == 0 and not [line for line in view.said if "Traceback" in line]
+        assert view.interrupt() == 0 and not [line for line in view.output if "Traceback" in line]
     finally:
         view.close()
     lines = [each[0] for each in tables["/log"]["TextLog:text"].to_pylist()]

@@ -49,8 +49,8 @@ def test_checkpoints_are_evaluated_beside_a_training_once_each_though_the_contro
     assert len(requested) == len(set(requested)) and len({each["checkpoint"] for each in found}) == len(found)
     assert {each["job"] for each in found} == {each["id"] for each in jobs}
     assert not any(each["keep"] for each in found)
-    best, told = best_checkpoint(run), server.detail(training)["results"]
+    best, reported = best_checkpoint(run), server.detail(training)["results"]
     means = {each["checkpoint"]: each["mean_return"] for each in found}
     assert best is not None and means[best.name] == max(means.values()), "the best one is never pruned"
-    assert told["best"]["checkpoint"] == best.name and told["best"]["of"] == len(means)
-    assert told["automatic"]["status"] == "SUCCEEDED"
+    assert reported["best"]["checkpoint"] == best.name and reported["best"]["of"] == len(means)
+    assert reported["automatic"]["status"] == "SUCCEEDED"

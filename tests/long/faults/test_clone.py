@@ -70,27 +70,27 @@ def test_the_first_policy_has_the_source_s_bits_and_all_else_is_new(
     assert int(list_checkpoints(Store(store).run(kind))[-1].manifest["env_steps"]) > 0
     make_clone(store, "clone", kind)
     shutil.rmtree(store / "runs" / kind)  # nothing that befalls the source matters
-    begun = runner(training(store, run="clone", iterations=4, **KINDS[kind]))
-    assert begun.resumed is None and begun.adopted is not None and begun.adopted.iteration == 4
-    assert f"starting from the weights of {kind}@4 (checkpoint 00000004-e1): 8 worlds on 1 rank" in begun._beginning()
-    own, there = (tensors(dict(state)) for state in (begun.algorithm.state_dict(), source))
-    networks = [name for name in there if is_network(name) and isinstance(there[name], torch.Tensor)]
+    started = runner(training(store, run="clone", iterations=4, **KINDS[kind]))
+    assert started.resumed is None and started.adopted is not None and started.adopted.iteration == 4
+    assert f"starting from the weights of {kind}@4 (checkpoint 00000004-e1): 8 worlds on 1 rank" in started._beginning()
+    own, existing = (tensors(dict(state)) for state in (started.algorithm.state_dict(), source))
+    networks = [name for name in existing if is_network(name) and isinstance(existing[name], torch.Tensor)]
     assert len(networks) > 6 and any("obs_normalizer" in name or "mean" in name for name in networks)
     for name in networks:
-        assert torch.equal(own[name], there[name]), name
-    saved = [name for name in there if "optimizer" in name and "/state/" in name]
+        assert torch.equal(own[name], existing[name]), name
+    saved = [name for name in existing if "optimizer" in name and "/state/" in name]
     assert saved and not any(name in own for name in saved if "optimizer" in name), "the optimizer is new"
-    assert begun.state.progress.iteration == 0 == begun.state.progress.env_steps
+    assert started.state.progress.iteration == 0 == started.state.progress.env_steps
     fresh = runner(training(store, run="fresh", iterations=4, **KINDS[kind]))
     for name, tensor in fresh.task.state_dict().items():
-        assert torch.equal(begun.task.state_dict()[name], tensor), f"{name} of the worlds is new"
+        assert torch.equal(started.task.state_dict()[name], tensor), f"{name} of the worlds is new"
 
 
 def test_the_learning_rate_is_the_setting_s_and_not_the_adapted_one(store: Path) -> None:
     adapted = list_checkpoints(Store(store).run("ppo"))[-1].manifest["learning_rate"]
     make_clone(store, "clone", "ppo")
-    begun = runner(training(store, run="clone", ppo={"learning_rate": 2e-4}))
-    assert isinstance(begun.algorithm, PPO) and float(begun.algorithm._rate) == pytest.approx(2e-4) != adapted
+    started = runner(training(store, run="clone", ppo={"learning_rate": 2e-4}))
+    assert isinstance(started.algorithm, PPO) and float(started.algorithm._rate) == pytest.approx(2e-4) != adapted
 
 
 def test_another_configuration_seed_and_length_apply_and_are_in_the_manifest(store: Path) -> None:
@@ -108,8 +108,8 @@ def test_a_clone_that_was_killed_before_its_first_checkpoint_begins_with_the_sam
     for name in ("straight", "killed"):
         make_clone(store, name, "ppo")
     train(training(store, run="straight", iterations=4, every=2))
-    begun = runner(training(store, run="killed", iterations=4, every=2))
-    begun._iterate()  # it dies here: nothing was saved
+    started = runner(training(store, run="killed", iterations=4, every=2))
+    started._iterate()  # it dies here: nothing was saved
     assert not list_checkpoints(Store(store).run("killed"))
     again = train(training(store, run="killed", iterations=2, every=2, epoch=2))
     assert again.adopted is not None
@@ -218,9 +218,9 @@ class Reader(PlainPPO):
 def test_an_algorithm_of_ones_own_may_read_another_s_weights(store: Path) -> None:
     make_clone(store, "clone", "ppo")
     settings = {"hidden_sizes": [16, 16], "steps": 8}
-    begun = begin(store, algorithm=f"{__name__}:Reader", settings=settings)
+    started = begin(store, algorithm=f"{__name__}:Reader", settings=settings)
     weights = learnt(last(store, "ppo"))["policy"]["mlp.0.weight"]
-    assert torch.equal(begun.algorithm.actor.layers[0].weight, weights)
+    assert torch.equal(started.algorithm.actor.layers[0].weight, weights)
     assert "reader" not in installed()
 
 
@@ -251,5 +251,5 @@ def test_weights_that_are_damaged_or_gone_are_refused(store: Path, harm: str) ->
 
 
 def test_a_run_that_is_no_clone_begins_with_new_weights(store: Path) -> None:
-    begun = runner(training(store, run="plain"))
-    assert begun.adopted is None and "starting from new weights" in begun._beginning()
+    started = runner(training(store, run="plain"))
+    assert started.adopted is None and "starting from new weights" in started._beginning()

@@ -188,12 +188,12 @@ PUPIL_REFUSED: dict[str, Any] = {
     **{"student": {"hidden_dims": [4]}, "teacher": {"hidden_dims": [4]}, "teacher_checkpoint": "rnd"},
     **{"algorithm.class_name": "PPO", "algorithm.optimizer": "adamw"},
 }
-GIVEN_BY_MUSTER = {"self", "storage", "device", "multi_gpu_cfg", "kwargs", "actor", "critic", "student", "teacher"}
+SET_BY_MUSTER = {"self", "storage", "device", "multi_gpu_cfg", "kwargs", "actor", "critic", "student", "teacher"}
 """What an algorithm of rsl_rl is built of, beside its settings."""
 
 
 def parameters(kind: Any) -> set[str]:
-    return {f"algorithm.{name}" for name in inspect.signature(kind.__init__).parameters if name not in GIVEN_BY_MUSTER}
+    return {f"algorithm.{name}" for name in inspect.signature(kind.__init__).parameters if name not in SET_BY_MUSTER}
 
 
 def with_value(settings: dict[str, Any], key: str, value: Any) -> dict[str, Any]:
@@ -260,7 +260,7 @@ def test_a_setting_of_curiosity_that_is_accepted_is_what_it_uses(store: Path, ke
 
 
 @pytest.mark.parametrize(
-    "name", sorted(GIVEN_BY_MUSTER - {"self", "kwargs", "storage", "actor", "critic", "student", "teacher"})
+    "name", sorted(SET_BY_MUSTER - {"self", "kwargs", "storage", "actor", "critic", "student", "teacher"})
 )
 def test_what_muster_gives_an_algorithm_of_rsl_rl_is_no_setting(store: Path, name: str) -> None:
     with pytest.raises(UserError, match=rf"rsl_rl\.algorithm\.{name}: there is no such key"):
@@ -296,9 +296,9 @@ def test_a_pupil_begins_with_the_copy_of_its_teacher_that_its_run_holds(store: P
     shutil.rmtree(opened.run("rsl").path)  # while the job waited
     for reference in ("rsl", "rsl@1"):
         settings = {**PUPIL_RUN, "teacher_checkpoint": reference}
-        begun = runner(training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl=settings)).algorithm
+        started = runner(training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl=settings)).algorithm
         original = go_on(store, "pupil", PUPIL_RUN).algorithm.state_dict()["teacher_state_dict"]["mlp.0.weight"]
-        assert torch.equal(begun.state_dict()["teacher_state_dict"]["mlp.0.weight"], original)
+        assert torch.equal(started.state_dict()["teacher_state_dict"]["mlp.0.weight"], original)
     with pytest.raises(UserError, match="run rsl has no checkpoint 2; there are: 1"):
         runner(
             training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl={**settings, "teacher_checkpoint": "rsl@2"})

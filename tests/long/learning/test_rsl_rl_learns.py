@@ -100,9 +100,9 @@ def test_symmetry_makes_a_policy_that_acts_alike_on_both_sides() -> None:
         task = cartpole()
         algorithm = learner(task, {"num_steps_per_env": 16, "algorithm": {"symmetry_cfg": symmetry}})
         train(algorithm, task, 30)
-        there = groups(task)
-        here = algorithm.policy().act(there)
-        mirrored = algorithm.policy().act(TensorDict({key: -value for key, value in there.items()}, [64]))
+        existing = groups(task)
+        here = algorithm.policy().act(existing)
+        mirrored = algorithm.policy().act(TensorDict({key: -value for key, value in existing.items()}, [64]))
         unlike[name] = float((here + mirrored).abs().mean() / here.abs().mean())
         mean_return, mean_length = evaluate(algorithm.policy(), task)
         assert mean_length > 295.0 and mean_return > HELD
@@ -159,12 +159,12 @@ def test_a_runner_of_ones_own_trains_logs_and_saves(tmp_path: Path) -> None:
         "actor": {**network, "distribution_cfg": GAUSSIAN},
         "critic": network,
     }
-    said = io.StringIO()
-    with contextlib.redirect_stdout(said):
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
         runner = OnPolicyRunner(env, config, str(tmp_path), "cpu")
         runner.learn(5, init_at_random_ep_len=True)
     assert {path.name for path in tmp_path.glob("model_*.pt")} == {"model_0.pt", "model_2.pt", "model_4.pt"}
-    assert "Mean episode reward_alive:" in said.getvalue() and "Mean reward:" in said.getvalue()
+    assert "Mean episode reward_alive:" in output.getvalue() and "Mean reward:" in output.getvalue()
     policy = runner.get_inference_policy()
     assert policy(env.get_observations()).shape == (32, 1)
     with pytest.raises(ValueError, match=r"task Cartpole has no setting wind; its settings are .*cart_limit"):

@@ -20,11 +20,11 @@ from tests.robots.worker.test_differential_ik import (
     ArmConfig,
     Planar,
     Skew,
-    asked,
     damped,
     jacobian,
     made,
     refused,
+    requested,
     tip,
     tip_jacobian,
     within,
@@ -93,8 +93,8 @@ def test_steps_to_a_pose_are_those_of_mujoco_s_jacobian_and_of_what_is_left_to_i
     task = made(Posed, frame=frame, position_weight=2.0, orientation_weight=0.5, max_step=5.0)
     aims = [palm(positions, frame) for positions in GOALS]
     lengths = (3.0, -0.5)  # of quaternions that need not have the length 1, and whose negative is the same rotation
-    wanted = [[*place, *(length * xyzw(turn))] for (place, turn), length in zip(aims, lengths, strict=True)]
-    found = asked(task, ARM_POSITIONS, wanted)
+    targets = [[*place, *(length * xyzw(turn))] for (place, turn), length in zip(aims, lengths, strict=True)]
+    found = requested(task, ARM_POSITIONS, targets)
     for world, positions in enumerate(ARM_POSITIONS):
         place, turn = palm(positions, frame)
         left = np.concatenate((aims[world][0] - place, rotation_vector(aims[world][1] @ turn.T)))
@@ -108,11 +108,11 @@ def test_steps_to_a_pose_are_those_of_mujoco_s_jacobian_and_of_what_is_left_to_i
 
 def test_a_movement_along_the_world_s_axes_is_turned_from_one_along_the_root_s() -> None:
     task = made(Skew, axes=POSE, frame="world", max_step=5.0)
-    wanted = np.array([[0.03, -0.02, 0.01, 0.05, -0.1, 0.02], [-0.01, 0.02, 0.05, -0.08, 0.0, 0.1]])
-    found = asked(task, ARM_POSITIONS, wanted)
+    targets = np.array([[0.03, -0.02, 0.01, 0.05, -0.1, 0.02], [-0.01, 0.02, 0.05, -0.08, 0.0, 0.1]])
+    found = requested(task, ARM_POSITIONS, targets)
     base = np.kron(np.eye(2), base_rotation())
     for world, positions in enumerate(ARM_POSITIONS):
-        expected = damped(base @ jacobian(ARM, positions, site="palm"), wanted[world])
+        expected = damped(base @ jacobian(ARM, positions, site="palm"), targets[world])
         np.testing.assert_allclose(found[world], within(positions, expected), atol=1e-4)
 
 
@@ -120,11 +120,11 @@ def test_the_palm_arrives_at_the_pose_and_stays_there() -> None:
     weightless = ArmConfig(randomize=Randomization(gravity=(0.0, 0.0)))
     task = Posed(weightless, 2, seed=3)
     task.reset()
-    asked(task, ARM_POSITIONS, np.zeros((2, 7)))  # worlds at these positions
+    requested(task, ARM_POSITIONS, np.zeros((2, 7)))  # worlds at these positions
     aims = [palm(positions) for positions in GOALS]
-    wanted = torch.tensor(np.array([[*place, *xyzw(turn)] for place, turn in aims]), dtype=torch.float32)
+    targets = torch.tensor(np.array([[*place, *xyzw(turn)] for place, turn in aims]), dtype=torch.float32)
     for _ in range(60):
-        task.step(wanted)
+        task.step(targets)
     for row, (place, turn) in zip(task.observations.numpy(), aims, strict=True):
         reached, turned = palm(row)
         assert np.linalg.norm(reached - place) < 1e-3
@@ -136,7 +136,7 @@ def test_without_a_quaternion_the_orientation_stays_as_it_is() -> None:
     place, turn = palm(ARM_POSITIONS[0])
     still = [[*place, 0.0, 0.0, 0.0, 0.0], [*palm(ARM_POSITIONS[1])[0], *xyzw(palm(ARM_POSITIONS[1])[1])]]
     assert abs(rotation_vector(turn)).max() > 0.1  # so that an identity would have turned it
-    np.testing.assert_allclose(asked(task, ARM_POSITIONS, still), 0.0, atol=2e-5)
+    np.testing.assert_allclose(requested(task, ARM_POSITIONS, still), 0.0, atol=2e-5)
 
 
 def test_one_action_held_brings_the_tip_to_its_place_seen_from_a_root_that_is_turned() -> None:
@@ -144,7 +144,7 @@ def test_one_action_held_brings_the_tip_to_its_place_seen_from_a_root_that_is_tu
     task = made(free, damping=0.02)
     positions = np.array([(0, 0, 0, 0, 0, 0, 1, 0.4, 0.9, 0.02), (1, -2, 0.5, 0, 0, 0.6, 0.8, 0.4, 0.9, 0.02)])
     aim = tip((0.4, 0.9)) + np.array([-0.02, 0.01])
-    found = asked(task, positions, np.tile([*aim, 0.0], (2, 1)), joints=[7, 8, 9])[:, :2]
+    found = requested(task, positions, np.tile([*aim, 0.0], (2, 1)), joints=[7, 8, 9])[:, :2]
     expected = damped(tip_jacobian(), (-0.02, 0.01), damping=0.02)
     np.testing.assert_allclose(found, np.tile(expected, (2, 1)), atol=1e-4)
 
@@ -170,14 +170,14 @@ def test_the_contract_names_numbers_of_a_pose_and_their_units() -> None:
     ],
 )
 def test_what_can_t_be_is_refused_in_one_line(options: dict[str, Any], message: str) -> None:
-    said = refused(ik=replace(Point.ik, **options), actions=Point.actions)
-    assert said.startswith("task Wrong: sensors.tip: DifferentialIK") and message in said
+    output = refused(ik=replace(Point.ik, **options), actions=Point.actions)
+    assert output.startswith("task Wrong: sensors.tip: DifferentialIK") and message in output
 
 
 def test_a_part_of_an_absolute_target_is_refused_in_one_line() -> None:
     part = {"tip": Action(terms.move_frame, size=1), "grip": Point.actions["grip"]}
-    said = refused(ik=Point.ik, actions=part)
-    assert "actions.tip: size is 1, and an absolute target has 2 columns; leave size= out" in said
+    output = refused(ik=Point.ik, actions=part)
+    assert "actions.tip: size is 1, and an absolute target has 2 columns; leave size= out" in output
 
 
 def test_scales_and_offsets_make_a_workspace_of_the_actions() -> None:

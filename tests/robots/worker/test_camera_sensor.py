@@ -103,10 +103,10 @@ def test_depth_and_names_are_those_of_mujocos_rays_from_a_site_that_moves(contex
     for world, joints in enumerate(((0.2, 0.1), (-0.3, 0.35))):
         reference.data.qpos[:2] = joints
         mujoco.mj_kinematics(reference.model, reference.data)
-        told, shown = rays(reference)
+        reported, shown = rays(reference)
         seen = depth.arrays.depths.numpy()[world]
         # an edge may fall on the other side of a pixel's ray
-        assert np.mean(np.abs(seen - told) < 1e-3 * (1.0 + told)) > 0.995
+        assert np.mean(np.abs(seen - reported) < 1e-3 * (1.0 + reported)) > 0.995
         masks = names.images[world].numpy()
         for channel, name in enumerate(names.names):
             assert (shown == name).any() or name == "robot", "the test sees nothing"
@@ -190,16 +190,16 @@ def test_mounts_differ_from_world_to_world_within_their_limits(context: SensorCo
     assert np.array_equal(found, camera(context, body="arm", **ranges).arrays.poses.numpy()), "seed and world alone"
     other = camera(context, "rear", body="arm", **ranges).arrays.poses.numpy()
     assert not np.allclose(found, other), "each camera has its own"
-    asked = camera(context, body="arm", randomize=Randomization(camera_position=0.3)).arrays.poses.numpy()
-    assert 0.0 < np.abs(asked - plain).max() <= 0.3
+    requested = camera(context, body="arm", randomize=Randomization(camera_position=0.3)).arrays.poses.numpy()
+    assert 0.0 < np.abs(requested - plain).max() <= 0.3
     twice = camera(context, body="arm", randomize=Randomization(camera_position=0.3))
     twice.begin(Randomization(camera_position=0.3))
     take(context, twice)
-    assert np.array_equal(twice.arrays.poses.numpy(), asked), "drawn once, however often"
-    given = context.episodes.random
+    assert np.array_equal(twice.arrays.poses.numpy(), requested), "drawn once, however often"
+    supplied = context.episodes.random
     context.episodes.random = wp.array([[7, 1, 0], [7, 2, 0]], dtype=wp.int32, device="cpu")
     later = camera(context, body="arm", **ranges).arrays.poses.numpy()
-    context.episodes.random = given
+    context.episodes.random = supplied
     assert np.array_equal(later[0], found[1]), "a world's mount does not depend on its rank"
 
 

@@ -105,12 +105,12 @@ def continues_alike(one: Any, other: Any, action: torch.Tensor) -> bool:
     return torch.equal(one.observations, other.observations)
 
 
-def asked(task: Any, positions: Any, wanted: Any, joints: Any = slice(None)) -> np.ndarray:
+def requested(task: Any, positions: Any, targets: Any, joints: Any = slice(None)) -> np.ndarray:
     """How far the joints' targets are from the joints, worlds being at these positions, shape ``(worlds, joints)``."""
     state = task.state_dict()
     state["joint_q"][:] = torch.tensor(positions)
     task.load_state_dict(state)
-    task.step(torch.tensor(wanted, dtype=torch.float32))
+    task.step(torch.tensor(targets, dtype=torch.float32))
     return task.worlds.arrays.controls.numpy() - np.array(positions)[:, joints]
 
 
@@ -129,20 +129,20 @@ def jacobian(text: str, positions: Any, site: str | None = None, body: str | Non
     return (base.T @ both).reshape(6, model.nv)
 
 
-def damped(moves: np.ndarray, wanted: Any, weights: Any = 1.0, damping: float = 0.05) -> np.ndarray:
+def damped(moves: np.ndarray, expected: Any, weights: Any = 1.0, damping: float = 0.05) -> np.ndarray:
     """How the joints move by damped least squares, of whose rows these are the weights."""
     weighed = moves.T * np.square(weights)
-    found: np.ndarray = np.linalg.solve(weighed @ moves + damping**2 * np.eye(moves.shape[1]), weighed @ wanted)
+    found: np.ndarray = np.linalg.solve(weighed @ moves + damping**2 * np.eye(moves.shape[1]), weighed @ expected)
     return found
 
 
 @pytest.mark.parametrize("place", [{"site": "palm", "body": None}, {"site": None, "body": "hand"}])
 def test_the_joints_steps_are_those_of_mujoco_s_jacobian_and_numpy(place: dict[str, Any]) -> None:
     task = made(Skew, **place, position_weight=2.0, orientation_weight=0.5, damping=0.05, max_step=5.0)
-    wanted = np.array([[0.03, -0.02, 0.01, 0.05, -0.1, 0.02], [-0.01, 0.02, 0.05, -0.08, 0.0, 0.1]])
-    found = asked(task, ARM_POSITIONS, wanted)
+    targets = np.array([[0.03, -0.02, 0.01, 0.05, -0.1, 0.02], [-0.01, 0.02, 0.05, -0.08, 0.0, 0.1]])
+    found = requested(task, ARM_POSITIONS, targets)
     for world, positions in enumerate(ARM_POSITIONS):
-        expected = damped(jacobian(ARM, positions, **place), wanted[world], [2.0] * 3 + [0.5] * 3)
+        expected = damped(jacobian(ARM, positions, **place), targets[world], [2.0] * 3 + [0.5] * 3)
         assert np.abs(expected).max() > 0.02
         np.testing.assert_allclose(found[world], within(positions, expected), atol=1e-4)
 
@@ -153,25 +153,25 @@ def test_the_axes_are_those_of_a_root_that_is_free_and_turned() -> None:
     positions = np.array([(*turn, 0.4, 0.9, 0.02) for turn in turns])
     positions[:, 3:7] /= np.linalg.norm(positions[:, 3:7], axis=1, keepdims=True)
     task = made(free, axes=("x", "y"))
-    found = asked(task, positions, np.tile([0.5, 1.0, 0.0], (2, 1)), joints=[7, 8, 9])[:, :2]
+    found = requested(task, positions, np.tile([0.5, 1.0, 0.0], (2, 1)), joints=[7, 8, 9])[:, :2]
     np.testing.assert_allclose(found, np.tile(damped(tip_jacobian(), [0.01, 0.01]), (2, 1)), atol=1e-4)
 
 
 def test_axes_that_are_not_named_are_free_and_the_posture_draws() -> None:
     task = made(Skew, axes=("z", "pitch"), posture_weight=0.3, max_step=5.0)
-    wanted = np.array([[0.05, -0.1], [0.0, 0.0]])
-    found = asked(task, ARM_POSITIONS, wanted)
+    targets = np.array([[0.05, -0.1], [0.0, 0.0]])
+    found = requested(task, ARM_POSITIONS, targets)
     for world, positions in enumerate(ARM_POSITIONS):
         moves = jacobian(ARM, positions, site="palm")[[2, 4]]
         left = moves.T @ moves + (0.0025 + 0.09) * np.eye(7)
-        right = moves.T @ wanted[world] - 0.09 * np.array(positions)
+        right = moves.T @ targets[world] - 0.09 * np.array(positions)
         np.testing.assert_allclose(found[world], within(positions, np.linalg.solve(left, right)), atol=1e-4)
 
 
 def test_targets_keep_to_the_greatest_step_and_within_the_limits() -> None:
     task = made(Skew, max_step=0.07, soft_factor=0.5)
     positions = np.array(ARM_POSITIONS)
-    found = asked(task, positions, np.full((2, 6), 5.0))
+    found = requested(task, positions, np.full((2, 6), 5.0))
     half = ENDS.copy()
     half[:, 3:5] = [[0.15, 0.05], [-0.15, -0.65]]  # half of [-0.3, 0.3] and of [-1, 0.4] about their middles
     for world in range(2):
@@ -187,7 +187,7 @@ def test_a_joint_beyond_its_limits_is_drawn_back_and_the_others_do_their_part() 
     # j5 is 0.3 beyond its 0.4; nothing is in the other world
     positions = (0.3, -0.5, 0.8, 0.1, 0.7, 0.4, 1.1), ARM_POSITIONS[0]
     task = made(Skew, limit_weight=3.0, max_step=5.0)
-    found = asked(task, positions, np.zeros((2, 6)))
+    found = requested(task, positions, np.zeros((2, 6)))
     moves, beyond = jacobian(ARM, positions[0], site="palm"), np.diag([0.0] * 4 + [9.0] + [0.0] * 2)
     expected = np.linalg.solve(moves.T @ moves + 0.0025 * np.eye(7) + beyond, beyond @ np.full(7, -0.3))
     expected[4] = -0.3  # whatever the equations say, the target is within the limits
@@ -251,7 +251,7 @@ def test_a_state_goes_on_bit_for_bit(goes_on: bool) -> None:
     one, other = made(Skew, from_targets=goes_on), made(Skew, from_targets=goes_on)
     action = torch.full((2, 6), 0.03)
     assert continues_alike(one, other, action)
-    assert not wp.to_torch(one.sensors["tip"].arrays.wanted).any()
+    assert not wp.to_torch(one.sensors["tip"].arrays.target).any()
 
 
 def test_actions_and_tables_and_the_contract_name_the_columns() -> None:
@@ -289,8 +289,8 @@ def refused(**changed: Any) -> str:
     ],
 )
 def test_what_can_t_be_is_refused_in_one_line(options: dict[str, Any], message: str) -> None:
-    said = refused(ik=replace(Planar.ik, **options))
-    assert said.startswith(f"task Wrong: sensors.tip: {message}")
+    output = refused(ik=replace(Planar.ik, **options))
+    assert output.startswith(f"task Wrong: sensors.tip: {message}")
 
 
 def test_actions_that_do_not_fit_are_refused_in_one_line() -> None:
@@ -301,16 +301,16 @@ def test_actions_that_do_not_fit_are_refused_in_one_line() -> None:
     both = replace(Planar.ik, site=None, body="finger", joints="*")
     driven = {"tip": Action(terms.move_frame, kind="position"), "grip": grip}
     assert "sensors.tip: joint grip is driven by two terms; each joint has one" in refused(ik=both, actions=driven)
-    for options, said in (
+    for options, output in (
         ({"size": 3}, "actions.tip: size is 3, more than the 2 columns of tip"),
         ({"offset": "default"}, 'offset="default" is for terms of joints'),
     ):
-        assert said in refused(actions={"tip": Action(terms.move_frame, **options)})
+        assert output in refused(actions={"tip": Action(terms.move_frame, **options)})
     two = PLANAR.replace('<joint name="elbow"', '<joint name="twist" axis="1 0 0"/><joint name="elbow"')
     assert "elbow is one of several joints between the same two bodies" in refused(text=two)
 
 
 def test_a_joint_without_an_actuator_is_refused_in_one_line() -> None:
     idle = Robot(PLANAR, actuators=(replace(SERVO, joints=("shoulder", "grip")),))
-    said = refused(robot=lambda self, config: idle)
-    assert "sensors.tip: joint elbow has no actuator; give the robot one" in said
+    output = refused(robot=lambda self, config: idle)
+    assert "sensors.tip: joint elbow has no actuator; give the robot one" in output

@@ -13,7 +13,7 @@ from tests.support.worker.declared import SmallConfig
 from tests.support.worker.motion_task import HZ, SECONDS, WORLDS, Turning, motion
 
 
-def begun(task: Any, steps: int) -> np.ndarray:
+def started(task: Any, steps: int) -> np.ndarray:
     """The second of the motion with which each episode of these steps began."""
     found, rest = [], torch.zeros(task.world_count, 1)
     for _ in range(steps):
@@ -29,12 +29,12 @@ def test_episodes_begin_where_they_failed_and_a_checkpoint_goes_on(
     monkeypatch.setattr(Turning, "motion", motion(tmp_path / "turning.npz"), raising=False)
     task, other = (Turning(SmallConfig(episode_seconds=10.0), WORLDS, seed=1) for _ in range(2))
     task.reset()
-    first = begun(task, 20)
-    later = begun(task, 150)
+    first = started(task, 20)
+    later = started(task, 150)
     shares = np.bincount(later.astype(int), minlength=SECONDS) / len(later)
     assert len(first) > 20 and shares[2] > 0.6 and (shares > 0).all(), shares
     assert float(task.sensors["motion"].arrays.sampling.evenness.numpy()[0]) < 0.9
 
     other.load_state_dict({name: value.clone() for name, value in task.state_dict().items()})
-    assert begun(task, 30).tolist() == begun(other, 30).tolist()
+    assert started(task, 30).tolist() == started(other, 30).tolist()
     assert torch.equal(task.observations, other.observations)

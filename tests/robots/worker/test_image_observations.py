@@ -127,9 +127,9 @@ def test_rsl_rl_learns_from_both_resumes_with_the_same_bits_and_exports(tmp_path
     assert_same_bits(last(tmp_path, "straight"), last(tmp_path, "stopped"))
     store = Store(tmp_path).run("straight")
     target = export(store, list_checkpoints(store)[-1], straight.task)  # compares the files with the policy itself
-    told = json.loads((target / "contract.json").read_text())
-    numbers, camera = told["groups"]
-    assert [(each["name"], each["input"], each["shape"]) for each in told["groups"]] == [
+    reported = json.loads((target / "contract.json").read_text())
+    numbers, camera = reported["groups"]
+    assert [(each["name"], each["input"], each["shape"]) for each in reported["groups"]] == [
         ("policy", "obs", [1]),
         ("camera", "camera", [6, 12, 16]),
     ]
@@ -183,11 +183,11 @@ def test_a_policy_may_see_an_image_alone() -> None:
 
 
 def test_the_list_of_tasks_describes_images() -> None:
-    told = describe(NAME, whole=True)
+    reported = describe(NAME, whole=True)
     words = "2 x color of 16 x 12 bytes, the present one first"
-    assert told["observations"] == ["rail_velocity", f"camera: {words}"]
-    assert told["tables"]["observations of camera"] == [{"camera": "front", "image": words}]
-    assert told["tables"]["sensors"][0]["kind"] == "CameraSensor"
+    assert reported["observations"] == ["rail_velocity", f"camera: {words}"]
+    assert reported["tables"]["observations of camera"] == [{"camera": "front", "image": words}]
+    assert reported["tables"]["sensors"][0]["kind"] == "CameraSensor"
     assert describe("tests.support.worker.seeing:SeeingAlone")["observations"] == [f"image: {words}"]
     assert describe("tests.support.worker.seeing:SeeingDepth")["observations"][2:] == [
         "camera: 1 x depth from 0.05 to 4 m of 16 x 12 bytes, the present one first"

@@ -22,7 +22,7 @@ from worker.tasks.library.lift import LiftCube
 
 pytestmark = needs_mjlab
 WORLDS = 4
-AWAY = [0.3, 0.15, 0.02, 0.0, 0.0, 0.0, 1.0]
+ABSENT = [0.3, 0.15, 0.02, 0.0, 0.0, 0.0, 1.0]
 """A cube that lies on the ground beside the gripper."""
 
 
@@ -199,7 +199,7 @@ def test_a_gripper_that_presses_on_the_ground_ends_the_episode(lift: LiftCube) -
     for angle in (1.7, 1.8, 1.9, 2.0):  # of the shoulder: the greater, the lower the hand
         joints = HOME.copy()
         joints[1] = angle
-        poses.append([*joints, *AWAY])
+        poses.append([*joints, *ABSENT])
     put(lift, joint_q=poses)
     for world, pose in enumerate(poses):
         model = slippery(reference(), lift, world)
@@ -233,7 +233,7 @@ def test_fingers_that_close_on_the_cube_hold_it_as_in_mujoco(lift: LiftCube) -> 
     model = slippery(reference(), lift, 0)
     joints = HOME.copy()
     joints[6:] = 0.0199, -0.0199  # the fingertips are a tenth of a millimetre into the cube's sides
-    position, rotation = site(model, to_mujoco(np.array([*joints, *AWAY])))
+    position, rotation = site(model, to_mujoco(np.array([*joints, *ABSENT])))
     position += 0.014 * rotation[:, 0]  # the middle between the tips
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, rotation.flatten())

@@ -150,8 +150,8 @@ def test_random_ones_stay_finite_within_the_solvers_capacity() -> None:
 
 def test_impossible_settings_are_refused_in_one_line() -> None:
     for cubes, problem in ((0, "greater than or equal to 1, found 0"), (7, "less than or equal to 6, found 7")):
-        said = refusal(configure, LiftCubes, {"config": {"cubes": cubes}}, error=UserError)
-        assert said.startswith(f"train.config.cubes: expected a value {problem}")
+        output = refusal(configure, LiftCubes, {"config": {"cubes": cubes}}, error=UserError)
+        assert output.startswith(f"train.config.cubes: expected a value {problem}")
 
 
 def test_a_selection_of_missing_or_fixed_parts_is_refused_in_one_line() -> None:
@@ -166,8 +166,8 @@ def test_a_selection_of_missing_or_fixed_parts_is_refused_in_one_line() -> None:
             declared = super().declare(config)
             return replace(declared, sensors={**declared.sensors, "cubes": ObjectSelection(self.selected)})
 
-    said = refusal(Wrong.sketch, LiftCubesConfig())
-    assert "sensors.cubes: no object matches 'cubs'; " in said and "there are robot, cube_0" in said
+    output = refusal(Wrong.sketch, LiftCubesConfig())
+    assert "sensors.cubes: no object matches 'cubs'; " in output and "there are robot, cube_0" in output
     Wrong.selected = "s*"
     fixed = "sensors.cubes: ObjectSelection: shelf is fixed to the world; leave it out"
     assert fixed in refusal(Wrong.sketch, LiftCubesConfig())

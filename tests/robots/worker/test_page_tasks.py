@@ -33,8 +33,8 @@ def played(task: Task, steps: int = 3) -> Task:
     for _ in range(steps):
         task.step(torch.randn(task.world_count, task.action_size, generator=generator))
     assert task.observations.isfinite().all()
-    told = SIZES.search(type(task).__doc__ or "")
-    assert not told or (len(task.observation_names), task.action_size) == (int(told[1]), int(told[2]))
+    reported = SIZES.search(type(task).__doc__ or "")
+    assert not reported or (len(task.observation_names), task.action_size) == (int(reported[1]), int(reported[2]))
     return task
 
 

@@ -60,8 +60,8 @@ def test_the_contract_names_frames_of_measurement_and_library_functions() -> Non
     assert terms_of["joint_pos"].frame is None and all(term.library for term in group.terms)
     ant = find_task("Ant")
     (group, *_) = policy_contract(ant(ant.config_type(), 1), "Ant").groups
-    told = {term.quantity: term.library for term in group.terms}
-    assert told["root_height"] and not told["attitude"], "the task's own function"
+    reported = {term.quantity: term.library for term in group.terms}
+    assert reported["root_height"] and not reported["attitude"], "the task's own function"
 
 
 def wired(task: Any, name: str) -> Wired:
@@ -75,9 +75,9 @@ def test_the_node_sees_what_a_robot_s_task_sees(name: str) -> None:
     """Noise is off; episodes of half a second end in between, and the motors' encoders have their bias."""
     task_type = find_task(name)
     task = task_type(task_type.config_type(numbers=EXACT, episode_seconds=0.5), 1, seed=3)
-    there = wired(task, name)
-    assert there.observations.needs == {"joint_states", "imu", "odom"}
-    assert assert_sees_what_the_task_sees(there, 60, 0.3) >= 2
+    existing = wired(task, name)
+    assert existing.observations.needs == {"joint_states", "imu", "odom"}
+    assert assert_sees_what_the_task_sees(existing, 60, 0.3) >= 2
 
 
 def test_the_node_sees_all_that_odometry_and_an_imu_tell() -> None:

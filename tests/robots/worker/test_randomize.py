@@ -349,5 +349,5 @@ def test_a_declaration_that_can_not_be_is_refused(what: str, options: dict[str, 
     ],
 )
 def test_a_missing_part_is_refused_with_the_entrys_name(entry: Randomize, message: str) -> None:
-    said = refusal(randomize, {"mine": entry}, *build_arm())
-    assert said.startswith("randomize.mine: ") and message in said
+    output = refusal(randomize, {"mine": entry}, *build_arm())
+    assert output.startswith("randomize.mine: ") and message in output

@@ -49,7 +49,7 @@ def cast(context: SensorContext, **options: Any) -> tuple[RayCasting, np.ndarray
     return built, built.arrays.distances.numpy()
 
 
-def told(world: int, origins: np.ndarray, directions: np.ndarray, alignment: str, site: bool) -> np.ndarray:
+def reported(world: int, origins: np.ndarray, directions: np.ndarray, alignment: str, site: bool) -> np.ndarray:
     """What MuJoCo's rays say, from the site or the arm's body."""
     reference = Reference(ARM.format(ground='<geom name="plane" type="plane" size="0 0 1"/>'))
     reference.data.qpos[:2] = ANGLES[world]
@@ -76,10 +76,10 @@ def test_a_scanner_measures_as_mujocos_rays_do(context: SensorContext, alignment
     built, distances = cast(context, site="eye", pattern=pattern, alignment=alignment)
     assert distances.shape == (2, 120) and len(built.names) == 120
     for world in range(2):
-        wanted = told(world, *pattern.rays(), alignment, site=True)
-        assert 0.1 < np.mean(wanted < FAR) < 1.0, "the test sees everything or nothing"
+        requested = reported(world, *pattern.rays(), alignment, site=True)
+        assert 0.1 < np.mean(requested < FAR) < 1.0, "the test sees everything or nothing"
         # an edge may fall on the other side of a ray
-        assert np.mean(np.abs(distances[world] - wanted) < 2e-3 * (1.0 + wanted)) > 0.97
+        assert np.mean(np.abs(distances[world] - requested) < 2e-3 * (1.0 + requested)) > 0.97
 
 
 def test_rays_of_a_grid_go_down_from_outside_the_robot(context: SensorContext) -> None:
@@ -97,7 +97,7 @@ def test_a_half_circle_of_rays_by_hand() -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "output"),
     [
         ({}, "RayCaster: give either body or site, and not both"),
         ({"body": "arn"}, "no body of robot matches 'arn'; did you mean arm"),
@@ -111,8 +111,8 @@ def test_a_half_circle_of_rays_by_hand() -> None:
         ({"body": "arm", "pattern": LidarPattern(elevations=(2.0,))}, "LidarPattern.elevations is [2.0]; use numbers"),
     ],
 )
-def test_wrong_rays_are_refused_in_one_line(context: SensorContext, options: dict[str, Any], said: str) -> None:
-    assert said in refusal(RayCaster(**options).build, context)
+def test_wrong_rays_are_refused_in_one_line(context: SensorContext, options: dict[str, Any], output: str) -> None:
+    assert output in refusal(RayCaster(**options).build, context)
 
 
 @dataclass(frozen=True)

@@ -107,12 +107,12 @@ def test_joints_between_one_pair_of_bodies_keep_their_names():
 
 
 def test_several_robots_and_objects_have_columns_of_their_own():
-    things = (
+    items = (
         Robot(ARM, name="left", actuators=(SERVO,), joint_positions={"yaw": 0.1}),
         Box("cube", size=(0.1, 0.2, 0.3), mass=2.0, position=(1.0, 0.0, 0.5)),
         Robot(ARM, name="right", position=(0.0, 2.0, 0.5), actuators=(SERVO,), joint_positions={"yaw": 0.2}),
     )
-    template, worlds = build(*things, worlds=2)
+    template, worlds = build(*items, worlds=2)
     views = [RobotView(template, name) for name in ("left", "cube", "right")]
     assert [view.joint_names for view in views] == [["yaw", "pitch", "reach"], [], ["yaw", "pitch", "reach"]]
     assert [view.actuators for view in views] == [[0, 1, 2], [], [3, 4, 5]]
@@ -135,7 +135,7 @@ def test_several_robots_and_objects_have_columns_of_their_own():
 
 
 @pytest.mark.parametrize(
-    ("thing", "kind", "size"),
+    ("item", "kind", "size"),
     [
         (Box("thing", mass=2.0, size=(0.2, 0.4, 0.6)), mujoco.mjtGeom.mjGEOM_BOX, (0.1, 0.2, 0.3)),
         (Sphere("thing", mass=2.0, radius=0.3), mujoco.mjtGeom.mjGEOM_SPHERE, (0.3, 0.0, 0.0)),
@@ -143,12 +143,12 @@ def test_several_robots_and_objects_have_columns_of_their_own():
     ],
     ids=["box", "sphere", "capsule"],
 )
-def test_an_object_weighs_what_mujoco_says_and_comes_to_rest(thing, kind, size):
+def test_an_object_weighs_what_mujoco_says_and_comes_to_rest(item, kind, size):
     spec = mujoco.MjSpec()
     spec.worldbody.add_body().add_geom(type=kind, size=size, mass=2.0)
     expected = spec.compile()
     arm = Robot(ARM, position=(5.0, 0.0, 0.5), actuators=(SERVO,))
-    lying = type(thing)(**{**vars(thing), "position": (0.0, 0.0, 0.36), "friction": 0.7})
+    lying = type(item)(**{**vars(item), "position": (0.0, 0.0, 0.36), "friction": 0.7})
     template, worlds = build(arm, lying, timestep=0.005, substeps=20)
     view = RobotView(template, "thing")
     model = worlds.solver.mj_model
@@ -162,7 +162,7 @@ def test_an_object_weighs_what_mujoco_says_and_comes_to_rest(thing, kind, size):
         worlds.simulate()
     root = view.root_coordinate
     q, qd = worlds.arrays.joint_q.numpy()[0], worlds.arrays.joint_qd.numpy()[0]
-    standing = {"Box": 0.3, "Sphere": 0.3, "Capsule": 0.35}[type(thing).__name__]
+    standing = {"Box": 0.3, "Sphere": 0.3, "Capsule": 0.35}[type(item).__name__]
     assert q[root + 2] == pytest.approx(standing, abs=0.01)
     assert np.abs(qd[view.root_dof : view.root_dof + 6]).max() < 0.05
 
@@ -178,9 +178,9 @@ def test_a_fixed_object_stays():
     np.testing.assert_allclose(body_arrays(worlds).poses.numpy()[0, view.root_body, :3], [0.0, 0.0, 2.0], atol=1e-6)
 
 
-def pairs_that_touch(*things) -> set[frozenset[str]]:
+def pairs_that_touch(*items) -> set[frozenset[str]]:
     """Names of the geoms of different bodies that MuJoCo's rule lets touch in the compiled model."""
-    model = build(*things)[1].solver.mj_model
+    model = build(*items)[1].solver.mj_model
     names = [model.geom(index).name.rpartition("_")[0].replace("/worldbody", "") for index in range(model.ngeom)]
     return touching_pairs(model, [name.rpartition("/")[2] for name in names])
 
@@ -258,7 +258,7 @@ def test_a_robot_moves_as_in_mujocos_own_engine(robot: Robot):
     data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)
     data.qpos[places] = default
     worlds.restore_defaults()
-    reached, wanted = [], []
+    reached, requested = [], []
     inputs = np.zeros(worlds.arrays.controls.shape, np.float32)
     for step in range(200):
         # every joint moves about its default position, no two alike
@@ -269,9 +269,9 @@ def test_a_robot_moves_as_in_mujocos_own_engine(robot: Robot):
         mujoco.mj_step(model, data)
         worlds.simulate()
         reached.append(worlds.arrays.joint_q.numpy()[0, view.coordinates])
-        wanted.append(data.qpos[places].copy())
-    assert np.ptp(np.array(wanted), axis=0).min() > 0.05, "every joint moves"
-    np.testing.assert_allclose(np.array(reached), np.array(wanted), atol=0.01)
+        requested.append(data.qpos[places].copy())
+    assert np.ptp(np.array(requested), axis=0).min() > 0.05, "every joint moves"
+    np.testing.assert_allclose(np.array(reached), np.array(requested), atol=0.01)
     root = worlds.arrays.joint_q.numpy()[0, :3]
     np.testing.assert_allclose(root, data.qpos[:3], atol=0.01)
 
@@ -295,7 +295,7 @@ def test_the_compiled_model_is_mujocos(robot: Robot):
             continue
         its = theirs.geom(name).id
         for field in ("contype", "conaffinity", "condim", "priority", "friction", "solref"):
-            mine, wanted = getattr(ours, f"geom_{field}")[index], getattr(theirs, f"geom_{field}")[its]
-            np.testing.assert_allclose(mine, wanted, rtol=1e-5, err_msg=f"{field} of {name}")
+            mine, requested = getattr(ours, f"geom_{field}")[index], getattr(theirs, f"geom_{field}")[its]
+            np.testing.assert_allclose(mine, requested, rtol=1e-5, err_msg=f"{field} of {name}")
         compared += 1
     assert compared == sum(bool(theirs.geom(name).contype[0]) for name in view.geom_names)

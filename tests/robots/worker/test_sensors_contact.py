@@ -160,18 +160,18 @@ def test_a_bouncing_ball_in_every_physics_step_and_in_every_control_step() -> No
     landings = [0, 0]
     for _ in range(60):
         step(context, fine, coarse)
-        begun, answers = seen[:-1], answers_of(fine.arrays, 5.0)
+        started, answers = seen[:-1], answers_of(fine.arrays, 5.0)
         del seen[:-1]
-        assert len(begun) == 4
+        assert len(started) == 4
         for world in range(2):
             by_hand, by_control_step = clocks[world]
             before = by_hand.contact, by_hand.air
-            for substep in begun:
+            for substep in started:
                 by_hand.tick(substep[world][0] > 0)
-            by_control_step.tick(begun[-1][world][0] > 0)
+            by_control_step.tick(started[-1][world][0] > 0)
             by_hand.check(fine.arrays, world)
             by_control_step.check(coarse.arrays, world)
-            strongest = [substep[world][2] for substep in reversed(begun)]
+            strongest = [substep[world][2] for substep in reversed(started)]
             np.testing.assert_allclose(fine.arrays.history.numpy()[world, 0], strongest, rtol=5e-3, atol=0.05)
             assert fine.arrays.peaks.numpy()[world, 0] == pytest.approx(max(strongest), rel=5e-3, abs=0.05)
             landed = before[0] == 0 and by_hand.contact > 0
@@ -268,8 +268,8 @@ def test_a_sensor_that_can_t_be_built_is_refused_in_one_line(arguments: dict[str
     text = walker().replace('<body name="left"', mast + '<body name="left"', 1)
     context = scene({"robot": text}, 1)
     assert "mast" not in ContactSensor(bodies="*").build(context).names
-    said = refusal(ContactSensor(**arguments).build, context)
-    assert all(part in said for part in parts), said
+    output = refusal(ContactSensor(**arguments).build, context)
+    assert all(part in output for part in parts), output
 
 
 def test_nothing_to_stand_on_and_a_solver_without_contacts_are_refused() -> None:

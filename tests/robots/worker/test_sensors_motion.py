@@ -226,8 +226,8 @@ def walking() -> SensorContext:
 def test_a_sensor_that_can_t_be_built_is_refused_in_one_line(
     walking: SensorContext, declared: SensorDeclaration, parts: list[Any]
 ) -> None:
-    said = refusal(declared.build, walking)
-    assert all(part in said for part in parts), said
+    output = refusal(declared.build, walking)
+    assert all(part in output for part in parts), output
 
 
 def test_an_imu_on_a_body_fixed_to_the_world_is_refused() -> None:

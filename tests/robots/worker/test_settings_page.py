@@ -36,7 +36,7 @@ def test_the_page_has_every_task_whose_robot_is_in_mjlab_and_every_term_of_it() 
         assert [term for term in terms if f"| `{term}` |" not in text] == []
 
 
-def given(path: Path, function: str | None = None) -> dict[str, int | None]:
+def supplied(path: Path, function: str | None = None) -> dict[str, int | None]:
     """Limits of the solver as a file of mjlab's gives them: of its calls, or what a function sets afterwards."""
     tree: ast.AST = ast.parse(path.read_text())
     if function is not None:
@@ -56,14 +56,14 @@ def test_what_it_says_of_mjlab_s_solver_is_in_mjlab_s_files() -> None:
     spec = find_spec("mjlab")
     assert spec is not None and spec.origin is not None
     tasks = Path(spec.origin).parent / "tasks"
-    walking = given(tasks / "velocity" / "velocity_env_cfg.py")
+    walking = supplied(tasks / "velocity" / "velocity_env_cfg.py")
     for robot in ("go1", "g1"):
         file = tasks / "velocity" / "config" / robot / "env_cfgs.py"
-        rough: Mapping[str, int | None] = walking | given(file, f"unitree_{robot}_rough_env_cfg")
+        rough: Mapping[str, int | None] = walking | supplied(file, f"unitree_{robot}_rough_env_cfg")
         title = robot.capitalize()
         assert MJLAB[f"{title}Rough"] == rough
-        assert MJLAB[f"{title}Flat"] == rough | given(file, f"unitree_{robot}_flat_env_cfg")
-    assert MJLAB["LiftCube"] == given(tasks / "manipulation" / "lift_cube_env_cfg.py")
+        assert MJLAB[f"{title}Flat"] == rough | supplied(file, f"unitree_{robot}_flat_env_cfg")
+    assert MJLAB["LiftCube"] == supplied(tasks / "manipulation" / "lift_cube_env_cfg.py")
     arm = (tasks / "manipulation" / "config" / "yam" / "env_cfgs.py").read_text()
     assert "cfg.sim.nconmax = max(cfg.sim.nconmax or 55, 55 + num_cubes * 120)" in arm and "num_cubes: int = 3" in arm
     assert MJLAB["LiftCubes"] == MJLAB["LiftCube"] | {"nconmax": 55 + 3 * 120}
@@ -77,6 +77,6 @@ def test_a_job_s_file_says_how_many_steps_it_takes_and_how_to_try_it_without_a_g
     train = yaml.safe_load(text)["train"]
     rollout = train.get("ppo", {}).get("steps", sketch(train["task"]).config.ppo.steps)
     steps = train["worlds"] * train["iterations"] * rollout
-    said = re.search(r"It takes (\d+) million steps[.;]", text)
-    assert said is not None and int(said[1]) == round(steps / 1e6)
+    output = re.search(r"It takes (\d+) million steps[.;]", text)
+    assert output is not None and int(output[1]) == round(steps / 1e6)
     assert f"muster run job_specs/{name}.yaml --set resources.gpus=0" in text

@@ -33,14 +33,14 @@ def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_pat
     listed = {task["name"]: task for task in found}
     assert listed.keys() >= BUILT_IN.keys()
     for name, where in BUILT_IN.items():
-        kind, told = find_task(name), listed[name]
+        kind, reported = find_task(name), listed[name]
         task = kind.sketch(kind.config_type())
-        assert told["class"] == where and told["rewards"] == dict(task.config_type().rewards)
+        assert reported["class"] == where and reported["rewards"] == dict(task.config_type().rewards)
         seen = task.observation_names
         if name == "CartpolePixels":
             seen = ("image: 2 x color of 64 x 64 bytes, the present one first",)
-        assert tuple(told["observations"]) == seen and tuple(told["actions"]) == task.action_names
-        assert told["control_hz"] == task.config_type().control_hz
+        assert tuple(reported["observations"]) == seen and tuple(reported["actions"]) == task.action_names
+        assert reported["control_hz"] == task.config_type().control_hz
     assert not (tmp_path / "home").exists(), "a listing needs no controller"
     console = Console(width=200)
     with console.capture() as captured:  # another process would import the simulation again

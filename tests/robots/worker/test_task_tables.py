@@ -24,7 +24,7 @@ DECLARED = sorted({*BUILT_IN} - {"CartpolePixels"})
 
 
 @functools.cache
-def told(name: str) -> dict[str, Any]:
+def reported(name: str) -> dict[str, Any]:
     return describe(name, whole=True)
 
 
@@ -36,7 +36,7 @@ def plan_of(name: str) -> Any:
 
 @pytest.mark.parametrize("name", DECLARED)
 def test_each_table_has_each_term_of_the_declaration_and_nothing_else(name: str) -> None:
-    found, plan = told(name), plan_of(name)
+    found, plan = reported(name), plan_of(name)
     declared = plan.declaration
     expected = {
         section: list(getattr(declared, section))
@@ -59,7 +59,7 @@ def test_each_table_has_each_term_of_the_declaration_and_nothing_else(name: str)
 
 @pytest.mark.parametrize("name", DECLARED)
 def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> None:
-    found, plan = told(name), plan_of(name)
+    found, plan = reported(name), plan_of(name)
     columns = sum(int(row["columns"]) for row in found["tables"]["observations"])
     assert columns == len(found["observations"]) == len(plan.names)
     assert {row["name"]: float(row["weight"]) for row in found["tables"]["rewards"]} == pytest.approx(found["rewards"])
@@ -80,7 +80,7 @@ def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> Non
 @pytest.mark.parametrize("name", DECLARED)
 def test_every_setting_of_the_configuration_is_told_but_those_of_training(name: str) -> None:
     config = plan_of(name).config
-    settings = {row["name"]: json.loads(row["value"]) for row in told(name)["tables"]["configuration"]}
+    settings = {row["name"]: json.loads(row["value"]) for row in reported(name)["tables"]["configuration"]}
     apart = {"rewards", "randomize", "numbers", "curriculum", "ppo", "sac", "rsl_rl"}
     fields = {item.name for item in dataclasses.fields(config)} - apart
     assert {path.partition(".")[0] for path in settings} == fields
@@ -91,15 +91,15 @@ def test_every_setting_of_the_configuration_is_told_but_those_of_training(name: 
 
 def test_changes_during_training_are_told_by_iteration() -> None:
     points = [[0, -0.01], [499, -0.01], [500, -0.1], [999, -0.1], [1000, -1.0]]
-    found = told("LiftCube")
+    found = reported("LiftCube")
     assert found["curriculum"] == {"joint_vel_hinge": points}
     text = "0: -0.01, 499: -0.01, 500: -0.1, 999: -0.1, 1000: -1"
     assert found["tables"]["curriculum"] == [{"name": "joint_vel_hinge", "value by iteration": text}]
-    walking = {row["name"]: row["value"] for row in told("G1Flat")["tables"]["configuration"]}
+    walking = {row["name"]: row["value"] for row in reported("G1Flat")["tables"]["configuration"]}
     assert walking["command_turn"] == "[[0, -0.5, 0.5], [5000, -0.7, 0.7]]"
-    assert walking["solver_iterations"] == "10" and told("G1Flat")["curriculum"] == {}
+    assert walking["solver_iterations"] == "10" and reported("G1Flat")["curriculum"] == {}
 
 
 def test_a_setting_of_several_parts_has_a_row_for_each() -> None:
-    rows = told("CartpolePixels")["tables"]["configuration"]
+    rows = reported("CartpolePixels")["tables"]["configuration"]
     assert {"name": "camera.width", "value": "64"} in rows

@@ -71,7 +71,7 @@ def test_a_body_with_an_off_centre_mass_moves_as_mujoco_says(rig: Rig) -> None:
         rig.bodies.poses = array(np.tile(state.body_q.numpy(), (WORLDS, 1, 1)), wp.transform)
         rig.bodies.velocities = array(np.tile(state.body_qd.numpy(), (WORLDS, 1, 1)), wp.spatial_vector)
         rig.bodies.coms = array(np.tile(found.body_com.numpy(), (WORLDS, 1, 1)), wp.vec3)
-        for term, wanted in (
+        for term, requested in (
             ("root_position", data.xpos[1]),
             ("root_linear_velocity", own[3:]),
             ("root_angular_velocity", own[:3]),
@@ -88,7 +88,7 @@ def test_a_body_with_an_off_centre_mass_moves_as_mujoco_says(rig: Rig) -> None:
             ("body_angular_velocity", world[:3]),
             ("body_angular_velocity_in_own_frame", own[:3]),
         ):
-            close(rig.call(term, robot=robot), np.tile(wanted, (WORLDS, 1)), term, atol=1e-4)
+            close(rig.call(term, robot=robot), np.tile(requested, (WORLDS, 1)), term, atol=1e-4)
     assert np.linalg.norm(world[3:] - of_com[3:]) > 0.1  # else the two velocities could not be told apart
 
 
@@ -163,7 +163,7 @@ def test_every_term_of_a_body_is_its_formula(rig: Rig) -> None:
         relative = np.einsum("wji,wjk->wik", base, matrices)
         gravity = -matrices[:, 2, :]
         cosine = np.clip((np.trace(relative, axis1=1, axis2=2) - 1) / 2, -1, 1)
-        for name, wanted in {
+        for name, requested in {
             "body_position": pose[:, :3],
             "body_height": pose[:, 2],
             "body_orientation": np.where(pose[:, 6:] < 0, -1, 1) * pose[:, 3:],
@@ -183,7 +183,7 @@ def test_every_term_of_a_body_is_its_formula(rig: Rig) -> None:
             "body_speed": np.linalg.norm(origin, axis=1),
             "body_speed_squared": (origin**2).sum(1),
         }.items():
-            close(rig.call(name, body), wanted, name)
+            close(rig.call(name, body), requested, name)
         close(matrix(rig.call("body_orientation_in_root", body)), relative)
         assert (rig.call("body_orientation_in_root", body)[:, 3] >= 0).all()
         np.testing.assert_allclose(np.cos(rig.call("body_turn_from_root", body)), cosine, atol=1e-5)

@@ -36,7 +36,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Rig:
     wrench, frame = WrenchArrays(), IkArrays()
     wrench.wrenches = array(np.zeros((WORLDS, BODIES, 6)), wp.spatial_vector)
     wrench.bodies, wrench.left = array([1, 4], wp.int32), array(np.zeros(WORLDS))
-    frame.wanted = array(np.zeros((WORLDS, 3)))
+    frame.target = array(np.zeros((WORLDS, 3)))
     structs = {WrenchArrays: wrench, IkArrays: frame}
     tested = terms_of("actions", "commands", "episode", "events")
     return Rig([*tested, "root_linear_velocity"], tmp_path_factory.mktemp("commands"), structs)
@@ -81,7 +81,7 @@ def test_actions_write_the_input_of_their_joints_actuator(rig: Rig) -> None:
         gain, rest = (numbers.numpy()[joint] for numbers in (rig.robot.gains, rig.robot.references))
         low, high = rig.robot.ranges.numpy()[joint]
         here = rig.q[:, coordinates[joint]]
-        for name, numbers, wanted in (
+        for name, numbers, requested in (
             ("effort", {"value": 1.7}, 1.7),
             ("limited_effort", {"value": 0.4}, 0.4 * effort / gain),
             ("limited_effort", {"value": -7.0}, -effort / gain),
@@ -98,7 +98,7 @@ def test_actions_write_the_input_of_their_joints_actuator(rig: Rig) -> None:
             rig.worlds.controls.zero_()
             rig.call(name, joint, **numbers)
             expected = np.zeros((WORLDS, ACTIONS))
-            expected[:, columns[joint]] = wanted
+            expected[:, columns[joint]] = requested
             np.testing.assert_allclose(rig.worlds.controls.numpy(), expected, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
@@ -118,7 +118,7 @@ def test_terms_of_actions_are_their_formulas(rig: Rig) -> None:
     now, last, earlier = (getattr(rig.episodes, name).numpy() for name in names)
     jerk = now - 2 * last + earlier
     for action in range(ACTIONS):
-        for name, wanted in {
+        for name, requested in {
             "last_action": last,
             "clipped_last_action": np.clip(last, -1, 1),
             "action_squared": now**2,
@@ -129,7 +129,7 @@ def test_terms_of_actions_are_their_formulas(rig: Rig) -> None:
             "action_acceleration_squared": jerk**2,
             "mean_action_acceleration": np.abs(jerk) / ACTIONS,
         }.items():
-            close(rig.call(name, action), wanted[:, action], name, rtol=1e-5, atol=1e-6)
+            close(rig.call(name, action), requested[:, action], name, rtol=1e-5, atol=1e-6)
 
 
 def test_velocity_commands_come_evenly_from_their_ranges_and_shares(rig: Rig) -> None:
@@ -143,8 +143,8 @@ def test_velocity_commands_come_evenly_from_their_ranges_and_shares(rig: Rig) ->
     still = ~found.any(axis=1)
     spot = ~found[:, :2].any(axis=1) & ~still
     ahead = ~found[:, 1:].any(axis=1) & ~still
-    for share, wanted in ((still, 0.3), (spot, 0.35), (ahead, 0.175)):
-        assert abs(share.mean() - wanted) < 4 * np.sqrt(wanted * (1 - wanted) / len(share))
+    for share, requested in ((still, 0.3), (spot, 0.35), (ahead, 0.175)):
+        assert abs(share.mean() - requested) < 4 * np.sqrt(requested * (1 - requested) / len(share))
     assert found[ahead, 0].min() >= 0.3 - 1e-6
     half = draws(rig, lambda: memory(rig, 5, 3), "velocity_command", command=5, grows=True, **ranges)
     full = draws(rig, lambda: memory(rig, 5, 3), "velocity_command", command=5, **ranges)
@@ -176,8 +176,8 @@ def test_a_heading_command_turns_the_robot_and_a_world_command_keeps_its_directi
             assert not steered.any() and not drawn.any()
             continue
         turned = np.clip(0.5 * np.angle(np.exp(1j * (hidden[:, 0] - yaw))), -0.4, 0.6)
-        wanted = drawn[:, 2] if shares.get("heading_share") == 0.0 else turned
-        np.testing.assert_allclose(steered[:, 2], wanted, atol=1e-5)
+        requested = drawn[:, 2] if shares.get("heading_share") == 0.0 else turned
+        np.testing.assert_allclose(steered[:, 2], requested, atol=1e-5)
         seen = (drawn[:, 0] + 1j * drawn[:, 1]) * (np.exp(-1j * yaw) if shares.get("world_share") else 1.0)
         np.testing.assert_allclose(steered[:, 0] + 1j * steered[:, 1], seen, atol=1e-5)
     term = "heading_velocity_command"
@@ -339,4 +339,4 @@ def test_wrenches_are_drawn_from_their_ranges_and_a_frame_is_told_where_to_go(ri
     left = wrench.left.numpy()
     assert (left >= 0.2).all() and (left <= 0.4).all() and (wrench.wrenches.numpy()[:, 1, :3] == 3.0).all()
     rig.call("move_frame", 1, value=0.5)
-    assert frame.wanted.numpy().tolist() == [[0.0, 0.5, 0.0]] * WORLDS
+    assert frame.target.numpy().tolist() == [[0.0, 0.5, 0.0]] * WORLDS

@@ -93,27 +93,27 @@ def rig(made: Rig) -> Iterator[Rig]:
 
 
 def test_tracking_rewards_and_errors(rig: Rig) -> None:
-    r, asked = rig.root(), rig.episodes.memory.numpy()[:, COMMAND : COMMAND + 3].astype(float)
-    planar = asked * [1, 1, 0]
+    r, requested = rig.root(), rig.episodes.memory.numpy()[:, COMMAND : COMMAND + 3].astype(float)
+    planar = requested * [1, 1, 0]
     seen = (r.linear[:, 0] + 1j * r.linear[:, 1]) * np.exp(-1j * r.yaw)
     for name, error in {
         "track_linear_velocity": ((r.own_origin - planar) ** 2).sum(1),
-        "track_angular_velocity": ((r.own_angular - asked * [0, 0, 1]) ** 2).sum(1),
-        "track_planar_velocity": ((r.own_linear - asked)[:, :2] ** 2).sum(1),
-        "track_planar_velocity_by_heading": np.abs(seen - asked[:, 0] - 1j * asked[:, 1]) ** 2,
-        "track_turning_velocity": (r.own_angular[:, 2] - asked[:, 2]) ** 2,
-        "track_turning_velocity_in_world": (r.angular[:, 2] - asked[:, 2]) ** 2,
+        "track_angular_velocity": ((r.own_angular - requested * [0, 0, 1]) ** 2).sum(1),
+        "track_planar_velocity": ((r.own_linear - requested)[:, :2] ** 2).sum(1),
+        "track_planar_velocity_by_heading": np.abs(seen - requested[:, 0] - 1j * requested[:, 1]) ** 2,
+        "track_turning_velocity": (r.own_angular[:, 2] - requested[:, 2]) ** 2,
+        "track_turning_velocity_in_world": (r.angular[:, 2] - requested[:, 2]) ** 2,
     }.items():
         near(rig.call(name, command=COMMAND, std=1.5), np.exp(-error / 2.25), name)
     near(
         rig.call("planar_velocity_error", command=COMMAND),
-        np.linalg.norm((r.own_origin - asked)[:, :2], axis=1),
+        np.linalg.norm((r.own_origin - requested)[:, :2], axis=1),
     )
-    near(rig.call("turning_velocity_error", command=COMMAND), np.abs(r.own_angular[:, 2] - asked[:, 2]))
+    near(rig.call("turning_velocity_error", command=COMMAND), np.abs(r.own_angular[:, 2] - requested[:, 2]))
     length = np.linalg.norm(planar, axis=1)
     along = np.where(length > 0, (r.own_origin * planar).sum(1) / np.maximum(length, 1e-9), 0)
     near(rig.call("velocity_along_command", command=COMMAND), np.minimum(along, length))
-    near(rig.call("heading_error", command=COMMAND), np.abs(asked[:, 2]))
+    near(rig.call("heading_error", command=COMMAND), np.abs(requested[:, 2]))
     near(rig.call("distance_left", command=COMMAND), length)
     near(rig.call("near_place", command=COMMAND, std=0.4), 1 - np.tanh(length / 0.4))
 
@@ -144,7 +144,7 @@ def test_contacts(rig: Rig) -> None:
     assert came.any() and not came.all() and touch.any()
     asks = np.array([[True], [False], [True]])  # for 0.7, 0.04 and 2.2; planar 0.5, 0 and 1.3
     for foot in range(FEET):
-        for name, wanted, numbers in (
+        for name, requested, numbers in (
             ("in_contact", touch, {}),
             ("contact_strength", norm, {}),
             ("air_time", air, {}),
@@ -165,7 +165,7 @@ def test_contacts(rig: Rig) -> None:
             ("contact_force_excess", np.maximum(peaks - 2, 0), {"force": 2.0}),
             ("illegal_contact", history.max(-1) > 18, {"force": 18.0}),
         ):
-            near(rig.call(name, foot, **numbers), wanted[:, foot], name)
+            near(rig.call(name, foot, **numbers), requested[:, foot], name)
         near(rig.call("contact_force", foot), force[:, foot])
         near(rig.call("contact_force_logarithm", foot), (np.sign(force) * np.log1p(np.abs(force)))[:, foot])
     near(rig.call("hard_contact_steps", force=18.0), (history.max(1) > 18).sum(-1))
@@ -233,12 +233,12 @@ def test_the_ground(rig: Rig) -> None:
     near(rig.call("scanned_height", 4, offset=0.5), heights[:, 4] - 0.5)
     near(rig.call("scanned_height_mean"), heights.mean(1))
     near(rig.call("scanned_height_error_squared", target=0.3), (heights.mean(1) - 0.3) ** 2)
-    r, wanted = rig.root(), []
+    r, requested = rig.root(), []
     for world, points in enumerate(scan.points.numpy().astype(float)):
         a, b, _ = np.linalg.lstsq(np.column_stack([points[:, :2], np.ones(POINTS)]), points[:, 2], rcond=None)[0]
         local = r.turn[world].T @ (np.array([-a, -b, 1]) / np.sqrt(a * a + b * b + 1))
-        wanted.append(np.exp(-(local[:2] ** 2).sum() / 0.64))
-    near(rig.call("upright_on_ground", std=0.8), wanted)
+        requested.append(np.exp(-(local[:2] ** 2).sum() / 0.64))
+    near(rig.call("upright_on_ground", std=0.8), requested)
     above = here[:, 2] - 0.3 * here[:, 0]
     near(rig.call("height_above_ground"), above)
     near(rig.call("too_low_above_ground", height=float(np.median(above))), above < np.median(above))
@@ -290,12 +290,12 @@ def test_tolerances_by_pattern() -> None:
     near(built.arrays.standing.numpy(), [0.1, 0.2, 0.1, 0.3])
     near(built.arrays.walking.numpy(), [0.1, 0.2, 0.1, 0.3])
     near(built.arrays.running.numpy(), [0.9] * 4)
-    for wrong, said in (
+    for wrong, output in (
         ({"standing": {"*_hipp": 0.1}}, "Tolerances.standing: no joint matches '*_hipp'; "),
         ({"standing": {"*": 0.0}}, "Tolerances.standing.*: a tolerance is a number above 0, found 0.0"),
         ({"standing": 0.1, "walking": {"*_hip": 0.2}}, "walking: no pattern fits left_knee, which standing has"),
     ):
-        assert said in refusal(Tolerances(**wrong).build, context)
+        assert output in refusal(Tolerances(**wrong).build, context)
 
 
 def test_what_counts_from_the_start_counts_from_the_patch_on_a_terrain(rig: Rig) -> None:

@@ -84,24 +84,24 @@ def rig(made: Rig) -> Iterator[Rig]:
 def test_terms_of_manipulation(rig: Rig) -> None:
     hand = rig.structs[FrameArrays].positions.numpy()[:, 0].astype(float)
     hand_turn = matrix(rig.structs[FrameArrays].rotations.numpy()[:, 0])
-    here, thing = rig.q[:, ROOT : ROOT + 3].astype(float), rig.q[:, OBJECT : OBJECT + 3].astype(float)
-    base, thing_turn = matrix(rig.q[:, ROOT + 3 : ROOT + 7]), matrix(rig.q[:, OBJECT + 3 : OBJECT + 7])
+    here, item = rig.q[:, ROOT : ROOT + 3].astype(float), rig.q[:, OBJECT : OBJECT + 3].astype(float)
+    base, item_turn = matrix(rig.q[:, ROOT + 3 : ROOT + 7]), matrix(rig.q[:, OBJECT + 3 : OBJECT + 7])
     memory = rig.episodes.memory.numpy().astype(float)
-    target, wanted_turn = memory[:, COMMAND : COMMAND + 3], base @ matrix(memory[:, COMMAND + 3 : COMMAND + 7])
+    target, expected_turn = memory[:, COMMAND : COMMAND + 3], base @ matrix(memory[:, COMMAND + 3 : COMMAND + 7])
     place = here + np.einsum("wij,wj->wi", base, target)
 
     def inside(way: np.ndarray, turn: np.ndarray = base) -> np.ndarray:
         return np.einsum("wji,wj->wi", turn, way)
 
     call, c = rig.call, {"command": COMMAND}
-    near(call("object_position_in_root"), inside(thing - here))
-    near(matrix(call("object_orientation_in_root")), np.swapaxes(base, 1, 2) @ thing_turn)
+    near(call("object_position_in_root"), inside(item - here))
+    near(matrix(call("object_orientation_in_root")), np.swapaxes(base, 1, 2) @ item_turn)
     near(call("object_velocity_in_root"), inside(rig.qd[:, OBJECT_DOF : OBJECT_DOF + 3]))
-    near(call("hand_to_object"), inside(thing - hand))
-    near(call("object_to_target", **c), inside(target - thing))
+    near(call("hand_to_object"), inside(item - hand))
+    near(call("object_to_target", **c), inside(target - item))
     near(call("target_in_hand", **c), inside(target - hand, hand_turn))
     near(call("target_in_root", **c), inside(target - here))
-    reach, bring = np.linalg.norm(thing - hand, axis=1), np.linalg.norm(target - thing, axis=1)
+    reach, bring = np.linalg.norm(item - hand, axis=1), np.linalg.norm(target - item, axis=1)
     near(call("hand_object_distance", robot=rig.other), reach)
     near(call("object_target_distance", robot=rig.other, **c), bring)
     near(call("reach_object", robot=rig.other, std=2.0), np.exp(-((reach / 2) ** 2)))
@@ -109,10 +109,10 @@ def test_terms_of_manipulation(rig: Rig) -> None:
     near(call("bring_object", robot=rig.other, std=2.0, **c), np.exp(-((bring / 2) ** 2)))
     staged = np.exp(-((reach / 2) ** 2)) * (1 + np.exp(-((bring / 3) ** 2)))
     near(call("reach_and_bring_object", robot=rig.other, reaching_std=2.0, bringing_std=3.0, **c), staged)
-    high = thing[:, 2] > np.median(thing[:, 2])
-    height = float(np.median(thing[:, 2])) + 1e-4
+    high = item[:, 2] > np.median(item[:, 2])
+    height = float(np.median(item[:, 2])) + 1e-4
     near(call("object_lifted", robot=rig.other, height=height), high)
-    far = np.linalg.norm(place - thing, axis=1)
+    far = np.linalg.norm(place - item, axis=1)
     near(call("lifted_object_near_command", std=2.0, height=height, **c), high * (1 - np.tanh(far / 2)))
     limit = float(np.median(bring)) + 1e-4
     near(call("object_at_target", robot=rig.other, distance=limit, **c), bring < limit)
@@ -120,8 +120,8 @@ def test_terms_of_manipulation(rig: Rig) -> None:
     reached = np.linalg.norm(place - hand, axis=1)
     near(call("hand_command_distance", **c), reached)
     near(call("hand_near_command", std=2.0, **c), 1 - np.tanh(reached / 2))
-    near(call("hand_command_turn", **c), angle(wanted_turn, hand_turn))
-    near(call("object_command_turn", **c), angle(wanted_turn, thing_turn))
+    near(call("hand_command_turn", **c), angle(expected_turn, hand_turn))
+    near(call("object_command_turn", **c), angle(expected_turn, item_turn))
 
     numbers = rig.episodes.memory.numpy()
     numbers[:, 20] = [0.0, 1.0, 0.0]  # the second was there before
@@ -134,7 +134,7 @@ def test_terms_of_manipulation(rig: Rig) -> None:
 def test_terms_of_following_a_motion(rig: Rig) -> None:
     m = rig.structs[MotionArrays]
     frame = [0, 3, FRAMES - 1]
-    wanted, wanted_turn = m.positions.numpy()[frame].astype(float), matrix(m.rotations.numpy()[frame])
+    requested, expected_turn = m.positions.numpy()[frame].astype(float), matrix(m.rotations.numpy()[frame])
     poses, velocities = rig.bodies.poses.numpy()[:, FOLLOWED].astype(float), rig.bodies.velocities.numpy()[:, FOLLOWED]
     here, turn = poses[..., :3], matrix(poses[..., 3:])
     arms = np.einsum("wbij,wbj->wbi", turn, rig.bodies.coms.numpy()[:, FOLLOWED])
@@ -146,10 +146,10 @@ def test_terms_of_following_a_motion(rig: Rig) -> None:
     for joint in range(JOINTS):
         near(rig.call("wanted_joint_position", joint, command=0), m.joint_positions.numpy()[frame, joint])
         near(rig.call("wanted_joint_velocity", joint, command=0), m.joint_velocities.numpy()[frame, joint])
-    way = wanted[:, ANCHOR] - anchor
+    way = requested[:, ANCHOR] - anchor
     near(rig.call("wanted_anchor_position", command=0), np.einsum("wij,wj->wi", back, way))
     for index in range(6):
-        elements = (back @ wanted_turn[:, ANCHOR])[:, :, :2].reshape(WORLDS, 6)
+        elements = (back @ expected_turn[:, ANCHOR])[:, :, :2].reshape(WORLDS, 6)
         near(rig.call("wanted_anchor_turn", index, command=0), elements[:, index])
     for body in range(3):
         near(rig.call("followed_body_position", body), np.einsum("wij,wj->wi", back, here[:, body] - anchor))
@@ -158,15 +158,15 @@ def test_terms_of_following_a_motion(rig: Rig) -> None:
             near(rig.call("followed_body_turn", 6 * body + index), elements[:, index])
 
     # relative references: carried to the robot's anchor along x and y and about the vertical
-    between = anchor_turn @ np.swapaxes(wanted_turn[:, ANCHOR], 1, 2)
+    between = anchor_turn @ np.swapaxes(expected_turn[:, ANCHOR], 1, 2)
     yaw = np.arctan2(between[:, 1, 0], between[:, 0, 0])
     about = np.zeros((WORLDS, 3, 3))
     about[:, 0, 0] = about[:, 1, 1] = np.cos(yaw)
     about[:, 1, 0], about[:, 0, 1], about[:, 2, 2] = np.sin(yaw), -np.sin(yaw), 1.0
-    origin = np.concatenate([anchor[:, :2], wanted[:, ANCHOR, 2:]], axis=1)
-    relative = origin[:, None] + np.einsum("wij,wbj->wbi", about, wanted - wanted[:, ANCHOR, None])
-    error, turned = relative - here, angle(about[:, None] @ wanted_turn, turn)
-    distance, anchor_angle = np.linalg.norm(error, axis=-1), angle(wanted_turn[:, ANCHOR], anchor_turn)
+    origin = np.concatenate([anchor[:, :2], requested[:, ANCHOR, 2:]], axis=1)
+    relative = origin[:, None] + np.einsum("wij,wbj->wbi", about, requested - requested[:, ANCHOR, None])
+    error, turned = relative - here, angle(about[:, None] @ expected_turn, turn)
+    distance, anchor_angle = np.linalg.norm(error, axis=-1), angle(expected_turn[:, ANCHOR], anchor_turn)
     for name, squares in {
         "follow_anchor_position": (way**2).sum(1),
         "follow_anchor_turn": anchor_angle**2,
@@ -178,10 +178,10 @@ def test_terms_of_following_a_motion(rig: Rig) -> None:
         near(rig.call(name, command=0, std=2.0), np.exp(-squares / 4), name)
     near(rig.call("anchor_distance", command=0), np.linalg.norm(way, axis=1))
     near(rig.call("anchor_turn_error", command=0), anchor_angle)
-    near(rig.call("mean_body_distance", command=0), np.linalg.norm(wanted - here, axis=-1).mean(1))
+    near(rig.call("mean_body_distance", command=0), np.linalg.norm(requested - here, axis=-1).mean(1))
     near(rig.call("mean_relative_body_distance", command=0), distance.mean(1))
     near(rig.call("mean_relative_body_turn", command=0), turned.mean(1))
-    tilt = np.abs(wanted_turn[:, ANCHOR, 2, 2] - anchor_turn[:, 2, 2])
+    tilt = np.abs(expected_turn[:, ANCHOR, 2, 2] - anchor_turn[:, 2, 2])
     for name, values in (
         ("anchor_too_far", np.linalg.norm(way, axis=1)),
         ("anchor_height_off", np.abs(way[:, 2])),
@@ -241,8 +241,8 @@ def _context() -> Any:
     names = [f"body_{number}" for number in range(BODIES)]
 
     def find(pattern: Any) -> list[int]:
-        wanted = [pattern] if isinstance(pattern, str) else pattern
-        return [index for index, name in enumerate(names) if name in wanted]
+        requested = [pattern] if isinstance(pattern, str) else pattern
+        return [index for index, name in enumerate(names) if name in requested]
 
     view = SimpleNamespace(
         joint_names=["j"] * JOINTS, body_names=names, bodies=list(range(3, 3 + BODIES)), find_bodies=find
@@ -265,7 +265,7 @@ def test_a_motion_is_read_from_its_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "output"),
     [
         ({"joint_vel": None}, r"motion.npz has no array joint_vel; it has .*joint_pos"),
         ({"joint_pos": np.zeros((6, 2))}, r"joint_pos of .* has the shape \(6, 2\); the robot has 5 joints and 7"),
@@ -273,18 +273,18 @@ def test_a_motion_is_read_from_its_file(tmp_path: Path) -> None:
         ({"fps": np.array([0.0])}, r"fps of .* must be one number above 0"),
     ],
 )
-def test_a_wrong_motion_is_refused_in_one_line(tmp_path: Path, changed: dict[str, Any], said: str) -> None:
+def test_a_wrong_motion_is_refused_in_one_line(tmp_path: Path, changed: dict[str, Any], output: str) -> None:
     motion = Motion(_file(tmp_path, **changed), bodies=["body_2"], anchor="body_2")
-    assert re.search(said, refusal(motion.build, _context()))
+    assert re.search(output, refusal(motion.build, _context()))
 
 
 def test_a_motion_that_is_not_there_or_has_another_anchor(tmp_path: Path) -> None:
     nothing, file = tmp_path / "nothing.npz", _file(tmp_path)
-    for path, anchor, said in (
+    for path, anchor, output in (
         (nothing, "body_2", f"Motion.file: {nothing} can't be read as a NumPy archive"),
         (file, "body_1", "Motion.anchor: name one of the bodies that are followed, not 'body_1'; body_2"),
     ):
-        assert said in refusal(Motion(path, bodies=["body_2"], anchor=anchor).build, _context())
+        assert output in refusal(Motion(path, bodies=["body_2"], anchor=anchor).build, _context())
 
 
 def test_frames_behind_which_worlds_failed_become_likelier() -> None:
@@ -301,9 +301,9 @@ def test_frames_behind_which_worlds_failed_become_likelier() -> None:
     near(state["failures"].numpy().sum(0), failures)
     own = failures + 0.5 / 4
     reached = own + 0.5 * own[[1, 2, 3, 3]]
-    wanted = reached / reached.sum()
-    near(sampling.arrays.likely.numpy(), np.cumsum(wanted))
-    near(sampling.arrays.evenness.numpy(), [-(wanted * np.log(wanted)).sum() / np.log(4)])
+    requested = reached / reached.sum()
+    near(sampling.arrays.likely.numpy(), np.cumsum(requested))
+    near(sampling.arrays.evenness.numpy(), [-(requested * np.log(requested)).sum() / np.log(4)])
 
 
 def test_failures_on_other_ranks_count_as_those_of_a_rank_itself() -> None:
@@ -324,5 +324,5 @@ def test_failures_on_other_ranks_count_as_those_of_a_rank_itself() -> None:
 def test_a_wrong_sampling_is_refused_in_one_line(changed: dict[str, Any], tmp_path: Path) -> None:
     name, value = next(iter(changed.items()))
     motion = Motion(_file(tmp_path), bodies=["body_2"], anchor="body_2", sampling=AdaptiveSampling(**changed))
-    said = refusal(motion.build, _context())
-    assert re.match(rf"AdaptiveSampling\.{name} is {value}; use a (whole )?number", said)
+    output = refusal(motion.build, _context())
+    assert re.match(rf"AdaptiveSampling\.{name} is {value}; use a (whole )?number", output)

@@ -188,8 +188,8 @@ def test_the_default_is_the_rough_terrain_of_others() -> None:
     ],
 )
 def test_an_impossible_configuration_is_refused_in_one_line(build: Any, parts: list[str]) -> None:
-    said = refusal(build)
-    assert all(part in said for part in parts), said
+    output = refusal(build)
+    assert all(part in output for part in parts), output
 
 
 def test_shapes_are_one_a_kind_and_boxes_where_the_ground_is_level() -> None:
@@ -240,10 +240,10 @@ def _walk(
     inside[world] = on_terrain(terrain, origin[0], origin[1], 0.0) and not on_terrain(terrain, 1e3, 0.0, 20.0)
 
 
-def walk(ground: Ground, places: np.ndarray, lived: Any, asked: Any) -> np.ndarray:
+def walk(ground: Ground, places: np.ndarray, lived: Any, requested: Any) -> np.ndarray:
     """Levels after episodes that end there, after so many steps with such commands."""
     positions, sums, memory = (np.zeros((len(places), width), np.float32) for width in (9, 3, 5))
-    positions[:, 2:4], sums[:, int(STEPS)], memory[:, 1:3] = places, lived, asked
+    positions[:, 2:4], sums[:, int(STEPS)], memory[:, 1:3] = places, lived, requested
     memory[:, [0, 3]] = 50.0  # not the command
     worlds, robot, episodes = WorldArrays(), RobotArrays(), build_episodes(len(places))
     robot.root_coordinate = 2

@@ -34,7 +34,7 @@ KINDS: tuple[Patch, ...] = (
     Stones(),
 )
 TERRAIN = Terrain(kinds=dict.fromkeys(KINDS, 1.0), levels=2, size=(4.0, 4.0), border=3.0)
-THING = """<mujoco><worldbody>
+ITEM = """<mujoco><worldbody>
   <body name="thing"><freejoint/>{geom}<site name="eye" pos="0.05 0.1 0.2" euler="0 0 30"/></body>
   <body name="slider" pos="0 0 60"><joint name="slide" type="slide" axis="1 0 0"/>
     <geom size="0.1" contype="0" conaffinity="0"/></body>
@@ -44,7 +44,7 @@ BALL = '<geom type="sphere" size="0.06" mass="1"/>'
 
 
 def context(geom: str, worlds: int, ground: bool | Terrain = TERRAIN) -> SensorContext:
-    return scene({"robot": THING.format(geom=geom)}, worlds, ground=ground)
+    return scene({"robot": ITEM.format(geom=geom)}, worlds, ground=ground)
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +58,7 @@ def _heights(terrain: TerrainArrays, places: wp.array[wp.vec2], heights: wp.arra
     heights[point] = ground_height(terrain, places[point][0], places[point][1])
 
 
-def looked_up(terrain: TerrainArrays, places: np.ndarray) -> np.ndarray:
+def found_names(terrain: TerrainArrays, places: np.ndarray) -> np.ndarray:
     heights = wp.zeros(len(places), dtype=wp.float32, device="cpu")
     inputs = [terrain, wp.array(places, dtype=wp.vec2, device="cpu"), heights]
     wp.launch(_heights, dim=len(places), inputs=inputs, device="cpu")
@@ -87,22 +87,22 @@ def test_ground_height_is_where_rays_of_mujoco_meet_the_ground(balls: SensorCont
     places = places.astype(np.float32)
     met = rays(balls.worlds.solver.mj_model, np.c_[places, np.full(len(places), 20.0)])
     assert met.min() < -0.7 and met.max() > 0.9, "pits and hills are among them"
-    assert looked_up(ground.arrays, places) == pytest.approx(met, abs=1e-4)
+    assert found_names(ground.arrays, places) == pytest.approx(met, abs=1e-4)
 
 
 def test_beyond_the_patches_and_without_a_terrain_the_ground_is_at_zero(balls: SensorContext) -> None:
     ground = balls.worlds.ground
     assert ground is not None
     far = np.array([(1e6, 0), (0, -1e9), (np.nan, 0), (-TERRAIN.corner[0] + 0.01, 1)], np.float32)
-    assert not looked_up(ground.arrays, far).any()
-    assert not looked_up(flat_ground("cpu"), np.append(far, [(0, 0), (0.5, 0.4)], axis=0).astype(np.float32)).any()
+    assert not found_names(ground.arrays, far).any()
+    assert not found_names(flat_ground("cpu"), np.append(far, [(0, 0), (0.5, 0.4)], axis=0).astype(np.float32)).any()
 
 
 def fall(worlds: Worlds, places: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Where things end that begin 8 cm above the highest ground around each place: here, and in MuJoCo's own engine."""
     assert worlds.ground is not None
     around = np.array([(x, y) for x in (-0.07, 0, 0.07) for y in (-0.07, 0, 0.07)])
-    highest = np.max([looked_up(worlds.ground.arrays, (places + step).astype(np.float32)) for step in around], axis=0)
+    highest = np.max([found_names(worlds.ground.arrays, (places + step).astype(np.float32)) for step in around], axis=0)
     worlds.restore_defaults()
     coordinates = worlds.arrays.joint_q.numpy().copy()
     coordinates[:, 0:2], coordinates[:, 2] = places, highest + 0.08
@@ -233,8 +233,8 @@ def test_a_scan_above_a_plane_measures_the_height_itself() -> None:
 def test_a_scan_that_cannot_be_measured_is_refused_in_one_line(
     scan: HeightScan, parts: list[str], balls: SensorContext
 ) -> None:
-    said = refusal(scan.build, balls)
-    assert all(part in said for part in parts), said
+    output = refusal(scan.build, balls)
+    assert all(part in output for part in parts), output
 
 
 def test_worlds_refuse_a_terrain_outside_memory() -> None:

@@ -64,17 +64,17 @@ def tasks() -> dict[str, Velocity]:
 def expected_rewards(name: str, twin: Twin, command: np.ndarray, action: np.ndarray, before: np.ndarray) -> Any:
     """Each reward per second, from MuJoCo's state and contacts."""
     data, view, walker = twin.data, twin.view, twin.task.walker
-    asked = float(np.linalg.norm(command[:2]) + abs(command[2]))
+    requested = float(np.linalg.norm(command[:2]) + abs(command[2]))
     linear, angular = twin.velocity(mujoco.mjtObj.mjOBJ_XBODY, walker.base, True)
     tilt = twin.turn(walker.torso)[2, :2]
     tipping = twin.velocity(mujoco.mjtObj.mjOBJ_XBODY, walker.torso, False)[1][:2]
     position = data.qpos[twin.places]
-    speed = 0 if asked < 0.05 else 1 if asked < 1.5 else 2
+    speed = 0 if requested < 0.05 else 1 if requested < 1.5 else 2
     allowed = np.array([next(v for k, v in JOINT[name].items() if k in joint)[speed] for joint in view.joint_names])
     ends = twin.model.jnt_range[[twin.model.joint(joint).id for joint in view.joint_names]]
     middle, half = ends.mean(1), 0.45 * (ends[:, 1] - ends[:, 0])
     heights, speeds = twin.soles()
-    moves = float(asked > 0.05)
+    moves = float(requested > 0.05)
     twin.peak = np.where(twin.found == 0, np.maximum(twin.peak, heights), twin.peak)
     landed = twin.landed()
     swing = float(((twin.peak / 0.1 - 1.0) ** 2)[landed].sum())
@@ -88,7 +88,7 @@ def expected_rewards(name: str, twin: Twin, command: np.ndarray, action: np.ndar
         "angular_momentum": np.sum(data.sensor("root_angmom").data ** 2),
         "dof_pos_limits": np.maximum(np.abs(position - middle) - half, 0.0).sum(),
         "action_rate_l2": np.sum((action - before) ** 2),
-        "air_time": float(((twin.air > 0.05) & (twin.air < 0.5)).sum()) * (asked > 0.5),
+        "air_time": float(((twin.air > 0.05) & (twin.air < 0.5)).sum()) * (requested > 0.5),
         "foot_clearance": moves * np.sum(np.abs(heights - 0.1) * speeds),
         "foot_swing_height": moves * swing,
         "foot_slip": moves * np.sum(speeds[twin.found > 0] ** 2),
@@ -122,8 +122,8 @@ def test_rewards_and_observations_are_those_of_mujocos_own_engine(tasks: dict[st
     first[:, 2] = heights + np.linspace(0.0, 0.02, WORLDS)  # some begin on the ground, some fall on it
     state["joint_qd"][:] = torch.tensor(random.normal(scale=0.3, size=state["joint_qd"].shape), dtype=torch.float32)
     memory = task.plan.binder.commands["twist"]
-    asked = [[0, 0, 0], [0.3, 0, 0], [0.6, -0.4, 0.2], [1.0, 1.0, 0.5], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.4]]
-    state["memory"][:, memory : memory + 3] = torch.tensor(asked)
+    requested = [[0, 0, 0], [0.3, 0, 0], [0.6, -0.4, 0.2], [1.0, 1.0, 0.5], [-1.0, 0.0, 0.0], [0.0, 0.0, 0.4]]
+    state["memory"][:, memory : memory + 3] = torch.tensor(requested)
     state["memory"][:, memory + 3 : memory + 9] = 0.0
     state["memory"][:, memory + 9] = 100.0  # they hold
     task.load_state_dict(state)
@@ -144,15 +144,15 @@ def test_rewards_and_observations_are_those_of_mujocos_own_engine(tasks: dict[st
             twin.step(targets)
             if task.dones[world]:
                 pytest.fail("nobody falls in this time")
-            command = np.array(asked[world], float)
+            command = np.array(requested[world], float)
             rewards = expected_rewards(name, twin, command, action[world], before[world])
             assert list(rewards) == list(task.reward_terms)
             got = (after[world] - sums[world])[2 : 2 + len(rewards)] / 0.02
-            for term, (value, wanted) in zip(rewards, zip(got, rewards.values(), strict=True), strict=True):
+            for term, (value, expected) in zip(rewards, zip(got, rewards.values(), strict=True), strict=True):
                 # a sum in float32 loses what it gained in a step, in proportion to itself
                 slack = 1e-4 * max(1.0, abs(float(after[world][2 + list(rewards).index(term)])))
-                assert float(value) == pytest.approx(float(wanted), rel=0.01, abs=2e-3 + slack), (term, world)
-                seen_terms[term] = max(seen_terms.get(term, 0.0), abs(float(wanted)))
+                assert float(value) == pytest.approx(float(expected), rel=0.01, abs=2e-3 + slack), (term, world)
+                seen_terms[term] = max(seen_terms.get(term, 0.0), abs(float(expected)))
             policy, critic = expected_groups(twin, command, action[world])
             np.testing.assert_allclose(task.observations[world], policy, atol=2e-3, rtol=2e-3)
             np.testing.assert_allclose(task.groups["critic"][world], critic, atol=0.03, rtol=0.02)
@@ -183,11 +183,11 @@ def test_every_joint_is_driven_about_its_home_position(tasks: dict[str, Velocity
     task, view = tasks[name], tasks[name].views["robot"]
     assert task.action_names == tuple(view.joint_names) and len(view.joint_names) == {"Go1Flat": 12, "G1Flat": 29}[name]
     home = dict(zip(view.joint_names, view.defaults, strict=True))
-    wanted = {
+    expected = {
         "Go1Flat": {"FR_hip_joint": 0.1, "RL_hip_joint": -0.1, "FL_thigh_joint": 0.9, "RR_calf_joint": -1.8},
         "G1Flat": {"left_hip_pitch_joint": -0.312, "right_knee_joint": 0.669, "left_shoulder_roll_joint": 0.2},
     }[name]
-    assert {joint: home[joint] for joint in wanted} == pytest.approx(wanted)
+    assert {joint: home[joint] for joint in expected} == pytest.approx(expected)
 
 
 def test_the_contract_names_the_commands(tasks: dict[str, Velocity]) -> None:
@@ -278,9 +278,9 @@ def test_without_the_package_there_is_one_line(monkeypatch: pytest.MonkeyPatch) 
     without = {"mjlab": lambda *_: None}
     monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: without.get(name, found)(name, *rest))
     kind: Any = find_task("G1Flat")
-    said = refusal(kind, kind.config_type(), 1)
-    assert "the Python package mjlab, which is not installed; " in said
-    assert " pip install --no-deps mjlab==1.6.0" in said
+    output = refusal(kind, kind.config_type(), 1)
+    assert "the Python package mjlab, which is not installed; " in output
+    assert " pip install --no-deps mjlab==1.6.0" in output
 
 
 @pytest.fixture(scope="module")
@@ -330,9 +330,9 @@ def test_it_sees_what_rays_of_mujoco_meet_and_stands_upright_on_it(rough: Veloci
             if values[0] >= 0.1 * values[1]:
                 normal = np.array([0.0, 0.0, 1.0])
             bumpy += values[0] > 1e-5
-            wanted = np.exp(-np.sum((turn.T @ normal)[:2] ** 2) / 0.2)
+            expected = np.exp(-np.sum((turn.T @ normal)[:2] ** 2) / 0.2)
             got = (state["episode_sums"].numpy() - before)[world, upright] / 0.02
-            assert got == pytest.approx(wanted, abs=5e-3)
+            assert got == pytest.approx(expected, abs=5e-3)
     assert bumpy, "some of the ground is not flat"
 
 

@@ -65,9 +65,9 @@ class Batch:
 
     def wait(self, job: str, *statuses: str, timeout: float = 60) -> dict[str, Any]:
         """The job's (or node's, or child's) detail, once it is in one of ``statuses`` (by default, over)."""
-        wanted = statuses or OVER
-        there = lambda: (detail := self.describe(job))["status"] in wanted and detail  # noqa: E731
-        found: dict[str, Any] = wait_for(there, timeout, f"{job} {wanted}")
+        requested = statuses or OVER
+        existing = lambda: (detail := self.describe(job))["status"] in requested and detail  # noqa: E731
+        found: dict[str, Any] = wait_for(existing, timeout, f"{job} {requested}")
         return found
 
     def reason(self, job: str, part: str) -> str:

@@ -37,12 +37,12 @@ def fuzz_report(request: pytest.FixtureRequest) -> Iterator[Counter[str]]:
     """How many requests of each class were sent; ``make fuzz`` ends with the table in ``benchmarks/fuzz.md``."""
     sent: Counter[str] = Counter()
     yield sent
-    if (asked := os.environ.get("MUSTER_FUZZ")) and not request.session.testsfailed:
+    if (requested := os.environ.get("MUSTER_FUZZ")) and not request.session.testsfailed:
         rows = "\n".join(f"| {name} | {count:,} |" for name, count in sent.items())
         (REPOSITORY / "benchmarks" / "fuzz.md").write_text(
             f"""# Malformed requests and hostile clients
 
-Written by `make fuzz N={asked}`, {datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} CPUs, Python {platform.python_version()}.
+Written by `make fuzz N={requested}`, {datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} CPUs, Python {platform.python_version()}.
 
 Every request goes over HTTP to a real server. None may be answered with a 5xx or leave a traceback in the server's log; while a hostile
 client is at work, another client must be answered and a job that it submits must run, with 256 descriptors for all of it.

@@ -30,7 +30,7 @@ class Fuzzed(Serving):
         """Ids for the placeholders of drawn requests."""
         self.counts: Counter[int] = Counter()
         """Requests by the status of the answer."""
-        self.heard = 0
+        self.offset = 0
         super().__init__(home, *options)
 
     def start(self) -> None:
@@ -86,8 +86,8 @@ class Fuzzed(Serving):
         if sum(self.counts.values()) % 100 == 99:
             self.restore()
         call = call.fill({**self.names, "new": f"new-{sum(self.counts.values())}"})
-        given = {"Authorization": f"Bearer {TOKEN}", **call.headers}
-        headers = [(name.encode(), value.encode("latin-1")) for name, value in given.items()]
+        supplied = {"Authorization": f"Bearer {TOKEN}", **call.headers}
+        headers = [(name.encode(), value.encode("latin-1")) for name, value in supplied.items()]
         target = {"target": call.target.encode()}
         with self.http.stream(call.method, "/", headers=headers, content=call.body, extensions=target) as answer:
             if "eventstream" not in answer.headers.get("content-type", ""):  # which would go on for hours
@@ -96,8 +96,10 @@ class Fuzzed(Serving):
 
     def check(self, answer: httpx.Response, call: Call) -> None:
         self.counts[answer.status_code] += 1
-        said = self.complaints()
-        assert answer.status_code < 500 and "Traceback" not in said, f"{answer.status_code} for {call}\n{said[-6000:]}"
+        output = self.complaints()
+        assert answer.status_code < 500 and "Traceback" not in output, (
+            f"{answer.status_code} for {call}\n{output[-6000:]}"
+        )
         if answer.status_code >= 400:
             assert answer.headers.get("x-amzn-errortype"), (call, answer.status_code, answer.headers)
             if call.method != "HEAD":
@@ -110,10 +112,10 @@ class Fuzzed(Serving):
     def complaints(self) -> str:
         """What the server wrote to its standard error since the last call."""
         with open(str(self.errors)) as errors:
-            errors.seek(self.heard)
-            said = errors.read()
-            self.heard = errors.tell()
-        return said
+            errors.seek(self.offset)
+            output = errors.read()
+            self.offset = errors.tell()
+        return output
 
     def close(self) -> None:
         super().close()

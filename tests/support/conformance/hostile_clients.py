@@ -150,8 +150,8 @@ def foreign_services(target: Target, count: int, rng: random.Random, meanwhile: 
     with httpx.Client(base_url=f"http://{target.host}:{target.port}", timeout=60) as http:
         for _ in range(count):
             method, path, headers, body = rng.choice(sent)
-            given = {**headers, "Authorization": f"Bearer {target.token}"}
-            assert 400 <= http.request(method, path, headers=given, content=body).status_code < 500
+            supplied = {**headers, "Authorization": f"Bearer {target.token}"}
+            assert 400 <= http.request(method, path, headers=supplied, content=body).status_code < 500
     meanwhile()
     return count
 

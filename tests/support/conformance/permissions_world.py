@@ -139,9 +139,9 @@ def definition(name: str) -> dict[str, Any]:
 
 
 def refusal_of(answer: httpx.Response, key: str) -> None:
-    told = answer.json()
-    assert (answer.status_code, told.get("__type")) == (403, "AccessDeniedException"), (key, answer.text)
-    assert f"key {key} " in told["message"] and "\n" not in told["message"], told
+    reported = answer.json()
+    assert (answer.status_code, reported.get("__type")) == (403, "AccessDeniedException"), (key, answer.text)
+    assert f"key {key} " in reported["message"] and "\n" not in reported["message"], reported
 
 
 def answers_as(row: str, world: World, operation: str, call: Callable[[str], httpx.Response], reads: bool) -> None:

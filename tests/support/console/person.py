@@ -31,7 +31,7 @@ class Person:
     """
 
     def __init__(self, browser: Browser, url: str, key: str = "", **context: Any) -> None:
-        self.url, self.asked, self.complaints = url, list[str](), list[str]()
+        self.url, self.requested, self.complaints = url, list[str](), list[str]()
         self._context = browser.new_context(base_url=url, **{"viewport": WIDE, **context})
         self._context.set_default_timeout(WAIT)
         self._context.on("request", self._on_request)
@@ -46,7 +46,7 @@ class Person:
             expect(self.page.get_by_role("button", name="Log out")).to_be_visible()
 
     def _on_request(self, request: Request) -> None:
-        self.asked.append(request.url)
+        self.requested.append(request.url)
 
     def _on_console(self, message: ConsoleMessage) -> None:
         if message.type in ("error", "warning") and not _EXPECTED.search(message.text):
@@ -87,7 +87,7 @@ class Person:
     @property
     def elsewhere(self) -> list[str]:
         """What the pages asked of anybody but the server."""
-        return [each for each in self.asked if not each.startswith((f"{self.url}/", "data:"))]
+        return [each for each in self.requested if not each.startswith((f"{self.url}/", "data:"))]
 
 
 class People:
@@ -103,5 +103,5 @@ class People:
     def check(self) -> None:
         """Raises AssertionError: a page broke its Content-Security-Policy, a script failed, or something came from elsewhere."""
         for each in self._all:
-            assert each.asked and each.elsewhere == []
+            assert each.requested and each.elsewhere == []
             assert each.complaints == []

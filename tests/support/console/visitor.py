@@ -44,8 +44,10 @@ class Page(HTMLParser):
                 return False
             if any(name == "style" or name.startswith("on") for name in attributes):
                 return False
-            given = [attributes[name] or "/" for name in ("src", "href", "action", "data-live") if name in attributes]
-            if any(not each.startswith(("/", "#")) or each.startswith("//") for each in given):
+            supplied = [
+                attributes[name] or "/" for name in ("src", "href", "action", "data-live") if name in attributes
+            ]
+            if any(not each.startswith(("/", "#")) or each.startswith("//") for each in supplied):
                 return False
         return True
 
@@ -87,8 +89,8 @@ class Visitor:
 
     def events(self, path: str, **headers: str) -> Iterator[tuple[str, Any, str]]:
         """Name, data and id of the events of a stream, as they come, until the caller leaves."""
-        given = {"Accept": "text/event-stream", **headers}
-        with self.http.stream("GET", path, headers=given) as answer:
+        supplied = {"Accept": "text/event-stream", **headers}
+        with self.http.stream("GET", path, headers=supplied) as answer:
             assert answer.status_code == 200 and answer.headers["content-type"].startswith("text/event-stream")
             result: dict[str, str] = {}
             for line in answer.iter_lines():

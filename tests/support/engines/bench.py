@@ -89,11 +89,11 @@ class Bench(ABC):
         """Launch the gang, if that was not done, and wait until every node has said ``ready``; returns the handle."""
         handle = self.launch(gang)
 
-        def said() -> bool:
+        def output() -> bool:
             status_of(self.engine, handle)  # as a controller does all the time
             return self.log(gang.attempt, job=gang.job, run=gang.run).count("ready") == len(gang.commands)
 
-        wait_for(said, 60, f"{len(gang.commands)} ready nodes")
+        wait_for(output, 60, f"{len(gang.commands)} ready nodes")
         return handle
 
     def ended(self, handle: Handle, engine: Engine | None = None) -> list[NodeStatus]:

@@ -45,24 +45,29 @@ class EveryEngine:
         detail = site.serving.wait(job, timeout=120)
         assert detail["status"] == "SUCCEEDED", (detail["statusReason"], site.serving.log(job)[-20:])
         lines = site.printed(job)
-        told = {int(each["RANK"]): each for each in map(json.loads, (line for line in lines if line.startswith("{")))}
-        assert sorted(told) == [0, 1, 2] and len({frozenset(each) for each in (told[1], told[2])}) == 1
+        reported = {
+            int(each["RANK"]): each for each in map(json.loads, (line for line in lines if line.startswith("{")))
+        }
+        assert sorted(reported) == [0, 1, 2] and len({frozenset(each) for each in (reported[1], reported[2])}) == 1
         address = "AWS_BATCH_JOB_MAIN_NODE_PRIVATE_IPV4_ADDRESS"
-        assert address not in told[0] and set(told[1]) == {*told[0], address}
-        for rank, each in told.items():
+        assert address not in reported[0] and set(reported[1]) == {*reported[0], address}
+        for rank, each in reported.items():
             found = [each[name] for name in ("GREETING", "WORLD_SIZE", "NNODES", "NODE_RANK")]
             assert found == [greeting, "3", "3", str(rank)]
             assert (each["AWS_BATCH_JOB_NODE_INDEX"], each["AWS_BATCH_JOB_NUM_NODES"]) == (str(rank), "3")
             assert each["AWS_BATCH_JOB_MAIN_NODE_INDEX"] == "0" and each["AWS_BATCH_JOB_ATTEMPT"] == "1"
             assert (each["MUSTER_JOB_ID"], each["MUSTER_RUN"]) == (job, detail["run"])
-            assert each["MASTER_ADDR"] == told[0]["MUSTER_ADDRESS"] and each["MASTER_PORT"] == told[0]["MASTER_PORT"]
+            assert (
+                each["MASTER_ADDR"] == reported[0]["MUSTER_ADDRESS"]
+                and each["MASTER_PORT"] == reported[0]["MASTER_PORT"]
+            )
             grace = "25" if site.engine == "aws-batch" else "30"  # AWS itself kills after 30
             assert each["MUSTER_GRACE_SECONDS"] == grace
             assert each.get("CUDA_VISIBLE_DEVICES", "") == ""
             assert "MUSTER_TOKEN" not in each and "MUSTER_URL" not in each
             mine = [line for line in lines if line.endswith(f" of {rank}")]
             assert mine == [f"line {number} of {rank}" for number in range(1, 201)], "whole and in order"
-        assert told[1][address] == told[0]["MUSTER_ADDRESS"]
+        assert reported[1][address] == reported[0]["MUSTER_ADDRESS"]
         nodes = detail["attempts"][0]["nodes"]
         assert [node["exitCode"] for node in nodes] == [0, 0, 0] and all(node["reason"] == "done" for node in nodes)
         await_job_end(job)

@@ -42,7 +42,7 @@ class RayBench(Bench):
         placements = [Placement(f"ray/{host}", gpus, cpus, 256) for host in hosts]
         return super().gang(script, len(hosts), suffix=suffix, **{"placements": placements, **changes})
 
-    def stopped_there(self, handle: Handle) -> list[int | None]:
+    def stopped_existing(self, handle: Handle) -> list[int | None]:
         """Exit codes of a gang that lost its third node, where that may go on until it ends itself."""
         self.engine.stop(handle, 5.0)
         return [node.exit_code for node in status_of(self.engine, handle)][:2]

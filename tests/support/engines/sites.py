@@ -88,13 +88,13 @@ def aws_batch(home: Path, request: pytest.FixtureRequest) -> Iterator[Site]:
         for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
             patch.setenv(name, "any")
         with Serving(home / "aws", "--cpus", "8") as aws:
-            told: dict[str, Any] = {
+            reported: dict[str, Any] = {
                 "region": "us-east-1",
                 "job_queue": "default",
                 "image": "muster",
                 "endpoint_url": aws.url,
             }
-            config = AwsConfig(**told, store=str(home / "volume"), store_is_shared=False, poll=0.1, quiet=1.0)
+            config = AwsConfig(**reported, store=str(home / "volume"), store_is_shared=False, poll=0.1, quiet=1.0)
             for name in ("home", "volume"):
                 (home / name).mkdir()
             # nothing is compiled again for a volume that was never used before

@@ -59,9 +59,9 @@ class SlurmBench(Bench):
     def saved(self, handle: Handle) -> None:
         """Wait until slurmctld has saved that the job runs: it does so every few seconds, and forgets the rest when it is killed."""
         number, state = handle.facts["slurm"], self.cluster.home / "state" / "job_state"
-        asked = time.time()
+        requested = time.time()
         self.cluster.run("scontrol", "update", f"jobid={number}", "admincomment=seen")
-        wait_for(lambda: state.exists() and state.stat().st_mtime > asked, 30, "the state is saved")
+        wait_for(lambda: state.exists() and state.stat().st_mtime > requested, 30, "the state is saved")
 
     def processes(self, text: str = "worker.supervisor") -> list[int]:
         """Pids of the cluster's processes with ``text`` in their command line."""

@@ -143,8 +143,8 @@ class SlurmCluster:
         def idle() -> bool:
             for name, daemon in self.daemons.items():
                 assert daemon.poll() is None, f"{name} ended: {(self.home / f'{name}.out').read_text()[-500:]}"
-            told = self.run("sinfo", "-h", "-p", "debug", "-N", "-o", "%T", check=False).split()
-            return told == ["idle"] * len(NODES)
+            reported = self.run("sinfo", "-h", "-p", "debug", "-N", "-o", "%T", check=False).split()
+            return reported == ["idle"] * len(NODES)
 
         wait_for(idle, 30, "all nodes are idle")
 

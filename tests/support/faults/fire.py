@@ -114,9 +114,9 @@ class Fire:
             spec = write_spec(
                 self.home.path / "spec.yaml", self.plan.nodes, self.plan.attempts, self.iterations, keep=3
             )
-            submitted, said = self.home.command("submit", str(spec))
+            submitted, output = self.home.command("submit", str(spec))
             if submitted is None:
-                raise Broken(f"submit: {said}")
+                raise Broken(f"submit: {output}")
             self.run = self.home.run(f"torture-{submitted['jobId'][:8]}")
             for blow in self.plan.blows:
                 if not self._strike(blow):
@@ -320,9 +320,9 @@ class Fire:
             self.home.strike(signal.SIGCONT)
             self._thaw_controller_at = None
         self._restart_at = None
-        resumed, said = self.home.command("resume", self.run.name)
+        resumed, output = self.home.command("resume", self.run.name)
         if resumed is None:
-            raise Broken(f"the run could not be resumed after its attempts were spent: {said}")
+            raise Broken(f"the run could not be resumed after its attempts were spent: {output}")
         self.say(f"resumed from iteration {resumed['iteration']} by another job")
         self._next_look = 0.0
 

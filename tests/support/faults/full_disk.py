@@ -103,8 +103,8 @@ def full_disk_round(directory: Path, seed: int) -> tuple[Counter[str], list[str]
                     client, wait_for(lambda: _taken_on(client), 60, "the controller to accept jobs again"), "SUCCEEDED"
                 )
                 done["jobs"] += len(taken) + 1
-            if (said := home.errors.stat().st_size) > MOST_LOG:
-                wrong.append(f"the controllers wrote {said} bytes of errors")
+            if (output := home.errors.stat().st_size) > MOST_LOG:
+                wrong.append(f"the controllers wrote {output} bytes of errors")
             if "Traceback" in home.errors.read_text():
                 wrong.append("the controllers wrote a traceback")
             if sqlite3.connect(home.path / "muster.db").execute("PRAGMA integrity_check").fetchone() != ("ok",):

@@ -43,7 +43,7 @@ class Home:
         return self.path / "controllers.err"
 
     @property
-    def _said(self) -> Path:
+    def _output(self) -> Path:
         return self.path / f"controller-{self.starts}.out"
 
     @property
@@ -55,7 +55,7 @@ class Home:
         """Start the controller; returns at once."""
         assert not self.up
         self.starts += 1
-        with open(self._said, "wb") as message, open(self.errors, "ab") as errors:
+        with open(self._output, "wb") as message, open(self.errors, "ab") as errors:
             self.process = subprocess.Popen(
                 [MUSTER, "serve", "--port", "0", "--cpus", "16", *self.options],
                 env={**os.environ, "MUSTER_HOME": str(self.path), **self.env},
@@ -70,7 +70,7 @@ class Home:
         if not self.up:
             self.start()
         deadline = time.monotonic() + _START_SECONDS
-        while b"Muster serves " not in self._said.read_bytes():
+        while b"Muster serves " not in self._output.read_bytes():
             if not self.up or time.monotonic() > deadline:
                 last = self.errors.read_text(errors="replace").strip().splitlines()[-1:]
                 raise Broken(f"`muster serve` did not start again: {last[0] if last else 'it says nothing'}")
@@ -79,7 +79,7 @@ class Home:
     @property
     def url(self) -> str:
         """Where the controller that answered last listens."""
-        return self._said.read_text().partition("Muster serves ")[2].split()[0]
+        return self._output.read_text().partition("Muster serves ")[2].split()[0]
 
     def strike(self, number: int) -> bool:
         """Send signal ``number`` to the controller; after SIGKILL it is gone on return. False where there is none."""

@@ -159,9 +159,9 @@ def _run(
 ) -> Verdict:
     """A run with one attempt under these blows, to its end."""
     spec = write_spec(home.path / "spec.yaml", nodes, 1, ITERATIONS, 3, STEPS)
-    submitted, said = home.command("submit", str(spec))
+    submitted, output = home.command("submit", str(spec))
     if submitted is None:
-        raise Broken(f"submit: {said}")
+        raise Broken(f"submit: {output}")
     run = home.run(f"torture-{submitted['jobId'][:8]}")
     for name in blows:
         before = reached(run, 1)

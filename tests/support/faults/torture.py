@@ -98,7 +98,7 @@ class Torture:
                 fire = Fire(home, plan, self.iterations, partial(self._hit, name))
                 result = fire.carry_out(self.references[plan.nodes])
                 self.results.append(result)
-                self._tell(result)
+                self._report(result)
                 if result.verdict.violations:  # its home is kept for whoever looks; the next run gets a new one
                     home.close()
                     home = Home(self.directory / f"home-{lane}-after-{plan.seed}", *_SOON)
@@ -123,7 +123,7 @@ class Torture:
             self._landed[name] = self._landed.get(name, 0) + 1
         self._say(name, text)
 
-    def _tell(self, result: Result) -> None:
+    def _report(self, result: Result) -> None:
         verdict = result.verdict
         self._say(
             result.plan.seed,
@@ -199,11 +199,11 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--rounds", type=int, default=10, help="of each class besides killing (default 10)")
     parser.add_argument("--directory", type=Path, help="where the homes go, and stay (default: a temporary directory)")
     parser.add_argument("--report", type=Path, default=REPOSITORY / "benchmarks" / "torture.md", help="the table")
-    given = parser.parse_args(arguments)
-    directory = (given.directory or Path(tempfile.mkdtemp(prefix="muster-torture-"))).resolve()
+    supplied = parser.parse_args(arguments)
+    directory = (supplied.directory or Path(tempfile.mkdtemp(prefix="muster-torture-"))).resolve()
     directory.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
-    torture = Torture(given.kills, given.seed, given.iterations, given.jobs, directory)
+    torture = Torture(supplied.kills, supplied.seed, supplied.iterations, supplied.jobs, directory)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda _number, _frame: torture.stop())
     results = torture.run()
@@ -211,18 +211,18 @@ def main(arguments: list[str] | None = None) -> int:
     wrong = [f"run {result.plan.seed}: {each}" for result in results for each in result.verdict.violations]
     rows = ["| class | rounds | what was done | violations |", "|---|--:|---|--:|"]
     for name in ROUNDS:
-        row, amiss = run_class(name, directory, given.seed, given.rounds)
+        row, amiss = run_class(name, directory, supplied.seed, supplied.rounds)
         rows.append(row)
         wrong += amiss
     classes = "\n".join(rows)
     print(f"\n{struck}\n\n{classes}")
     found = "\n".join(["\n## What was wrong\n", *(f"- {each}" for each in wrong), ""]) if wrong else ""
     total = sum(len(result.hits) for result in results)
-    given.report.write_text(f"""# Kill anything, at any instant
+    supplied.report.write_text(f"""# Kill anything, at any instant
 
-Written by `make torture N={total}` (`python -m tests.support.faults.torture --seed {given.seed} --jobs {given.jobs}`), {datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} CPUs, Python {platform.python_version()}.
+Written by `make torture N={total}` (`python -m tests.support.faults.torture --seed {supplied.seed} --jobs {supplied.jobs}`), {datetime.now(UTC):%Y-%m-%d}, {os.cpu_count()} CPUs, Python {platform.python_version()}.
 
-A Cartpole job of {given.iterations} iterations with a checkpoint every 10 is run straight, then again and again through the real command and
+A Cartpole job of {supplied.iterations} iterations with a checkpoint every 10 is run straight, then again and again through the real command and
 controller while signals hit its processes at random moments. Every run must end with the straight run's tensors, bit for bit, in all
 checkpoints that it has left; every metrics record that was ever written must be the straight run's (timing apart), none missing or
 doubled; attempts, launches and epochs must agree; every attempt must have its reason; no process and no hidden file may be left.
@@ -239,10 +239,10 @@ frozen, replaced by an empty directory, or full, and a controller that moves to 
 {classes}
 {found}""")
     for violation in wrong:
-        print(f"VIOLATION (--seed {given.seed}) {violation}")
+        print(f"VIOLATION (--seed {supplied.seed}) {violation}")
     if wrong:
         print(f"homes: {directory}")
-    elif given.directory is None:
+    elif supplied.directory is None:
         shutil.rmtree(directory)
     return 1 if wrong else 0
 

@@ -20,8 +20,8 @@ _PARTS = ("orchestrator", "shared_store", "worker", "containers", "pyproject.tom
 
 def is_in_history(commit: str = COMMIT) -> bool:
     """Whether this checkout's history holds the commit; a copy without ``.git``, or a shallow one, does not."""
-    asked = subprocess.run(["git", "cat-file", "-e", f"{commit}^{{commit}}"], cwd=REPOSITORY, capture_output=True)
-    return asked.returncode == 0
+    requested = subprocess.run(["git", "cat-file", "-e", f"{commit}^{{commit}}"], cwd=REPOSITORY, capture_output=True)
+    return requested.returncode == 0
 
 
 def make_environment(directory: Path, commit: str = COMMIT) -> tuple[str, ...]:

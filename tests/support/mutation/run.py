@@ -133,14 +133,14 @@ def measure(names: Sequence[str], seed: int, which: str) -> Results:
     for group in GROUPS:
         numbers = {m: n for m, n in chosen(group, seed).items() if not names or any(name in m for name in names)}
 
-        def wanted(module: str, mutant: Mutant, numbers: Mapping[str, set[int]] = numbers) -> bool:
+        def requested(module: str, mutant: Mutant, numbers: Mapping[str, set[int]] = numbers) -> bool:
             if mutant.number not in numbers[module] or mutant.key in known.get(module, ()):
                 return False
             result, _ = last.by_module[module].get(mutant.key, ("", 0.0))
             return which == "all" or result == (SURVIVED if which == "survivors" else "")
 
         if any(numbers.values()):
-            Trial([*numbers], group.tests, wanted, results.note, group.options, group.bounds_memory).run()
+            Trial([*numbers], group.tests, requested, results.note, group.options, group.bounds_memory).run()
     return Results(path)  # children have noted most of them
 
 

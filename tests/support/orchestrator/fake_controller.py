@@ -64,8 +64,8 @@ class FakeController(Generic[E]):
         with self.database.session() as session:
             return session.get_one(Job, name)
 
-    def wait(self, name: str, *wanted: Status) -> Job:
-        found: Job = wait_for(lambda: (j := self.job(name)).status in wanted and j, 30, f"{name} is {wanted}")
+    def wait(self, name: str, *requested: Status) -> Job:
+        found: Job = wait_for(lambda: (j := self.job(name)).status in requested and j, 30, f"{name} is {requested}")
         return found
 
     def ticks(self, condition: Callable[[], bool]) -> None:
@@ -77,14 +77,14 @@ class FakeController(Generic[E]):
 
         wait_for(holds, 30, "the state")
 
-    def explains(self, name: str, said: str) -> None:
+    def explains(self, name: str, output: str) -> None:
         """Wait until a job's reason, as every answer shows it, has these words."""
 
         def reason() -> str:
             found = self.job(name)
             return self.controller.admission.reason(found).words
 
-        wait_for(lambda: said in reason(), 30, f"{name} says {said!r}")
+        wait_for(lambda: output in reason(), 30, f"{name} says {output!r}")
 
     def runs_and_ends(self, *names: str) -> None:
         """Submit jobs, and have them end well once they run."""

@@ -40,12 +40,12 @@ def detail(client: Client, job_id: str) -> dict[str, Any]:
     return found
 
 
-def await_status(client: Client, job_id: str, *wanted: str) -> dict[str, Any]:
-    def there() -> dict[str, Any] | None:
+def await_status(client: Client, job_id: str, *requested: str) -> dict[str, Any]:
+    def existing() -> dict[str, Any] | None:
         found = detail(client, job_id)
-        return found if found["status"] in wanted else None
+        return found if found["status"] in requested else None
 
-    found: dict[str, Any] = wait_for(there, 30, f"job {job_id} {wanted}")
+    found: dict[str, Any] = wait_for(existing, 30, f"job {job_id} {requested}")
     return found
 
 

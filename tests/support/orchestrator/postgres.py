@@ -50,7 +50,7 @@ class Server:
         self.port, self._start, self._stop = port, start, stop
 
     @contextmanager
-    def away(self) -> Iterator[None]:
+    def absent(self) -> Iterator[None]:
         """It crashes, and is started again at the end."""
         _as_postgres(*self._stop)
         try:

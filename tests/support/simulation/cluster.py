@@ -39,7 +39,7 @@ class SimulatedNode:
     exit_code: int | None = None
     """Of its own; None while it runs, and for one that was killed or vanished."""
     killed: bool = False
-    asked: bool = False
+    requested: bool = False
     """It was asked to end."""
     silent_since: float | None = None
     """Since when it is frozen or isolated [s]."""
@@ -84,7 +84,7 @@ class Cluster:
     def __init__(self, world: Simulation) -> None:
         self._world, self._machine, self._rng = world, world.machine, world.rng
         self.gangs: dict[str, SimulatedGang] = {}
-        self._asked: dict[str, float] = {}
+        self._requested: dict[str, float] = {}
         """When each launch was asked for first."""
 
     @property
@@ -93,7 +93,7 @@ class Cluster:
 
     def pulls(self, gang: Gang) -> bool:
         """Whether its image is still being pulled: since its launch was asked for."""
-        since = self._asked.setdefault(gang.name, self._machine.time)
+        since = self._requested.setdefault(gang.name, self._machine.time)
         return gang.name not in self.gangs and self._machine.time - since < self._world.job(gang.job).pulling
 
     def launch(self, gang: Gang) -> None:
@@ -120,7 +120,7 @@ class Cluster:
         self._world.invariants.check_cause(gang)
         deadline = self._machine.time + grace
         for node in gang.running:
-            node.asked = True
+            node.requested = True
             self._machine.after(self._rng.uniform(0.1, 4.0), partial(self._leave, node))
         while gang.running and self._machine.time < deadline:
             self._machine.sleep(0.5)
@@ -176,7 +176,7 @@ class Cluster:
             self._finish(node, EX_TEMPFAIL)
 
     def _finish(
-        self, node: SimulatedNode, code: int, tries: int = _TRIES, asked: bool | None = None, fault: bool = False
+        self, node: SimulatedNode, code: int, tries: int = _TRIES, requested: bool | None = None, fault: bool = False
     ) -> None:
         """The node ends: it writes its outcome until that stands, or leaves without one after a while.
 
@@ -184,25 +184,25 @@ class Cluster:
         """
         if not node.alive:
             return
-        was_asked = node.asked if asked is None else asked
+        was_requested = node.requested if requested is None else requested
         if not node.acts:
-            self._machine.after(5.0, lambda: self._finish(node, code, tries, was_asked, fault))
+            self._machine.after(5.0, lambda: self._finish(node, code, tries, was_requested, fault))
             return
         gang, volume = node.gang, self._world.volume
         can_write = not volume.unusable and gang.run in volume.runs
-        if not can_write and tries and not node.asked:
-            self._machine.after(1.0, lambda: self._finish(node, code, tries - 1, was_asked, fault))
+        if not can_write and tries and not node.requested:
+            self._machine.after(1.0, lambda: self._finish(node, code, tries - 1, was_requested, fault))
             return
         if can_write:
             wall, words = self._machine.wall(), f"exit {code}"
             error = FirstError(0, words, "", wall, _FAULT) if fault else None
-            outcome = Outcome(node.index, gang.epoch, code, None, words, error, wall - 1, wall, asked=was_asked)
+            outcome = Outcome(node.index, gang.epoch, code, None, words, error, wall - 1, wall, requested=was_requested)
             if fault:
                 self._world.job(gang.job).faults.add(gang.attempt)
             volume.runs[gang.run].outcomes[gang.job, gang.attempt, node.index] = outcome
         node.alive, node.exit_code = False, code
         if node.index == 0 and code != EX_TEMPFAIL:
-            self._world.job(gang.job).main_ends.append((gang.attempt, code, was_asked))
+            self._world.job(gang.job).main_ends.append((gang.attempt, code, was_requested))
         self._world.notice(node, 0.2)
         if node.index == 0 and code == 0:
             for other in gang.running:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 HOSTS = 6
 CORES = 2.0
-AWAY = "the simulated engine can't be reached"
+ABSENT = "the simulated engine can't be reached"
 HANGS = "the simulated engine has not answered since"
 
 
@@ -78,7 +78,7 @@ class SimulatedEngine:
         while self._world.engine_hangs:
             self._world.machine.sleep(1.0)
         if self._world.engine_down:
-            raise OSError(AWAY)
+            raise OSError(ABSENT)
 
 
 def _status(node: SimulatedNode) -> NodeStatus:

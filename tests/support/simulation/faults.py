@@ -85,7 +85,9 @@ def _break_bus(world: Simulation, rng: Random, seconds: float) -> None:
             world.notice(node, world.rng.uniform(0.5, _LEASE) + position * pace)
 
     def end() -> None:
-        if world.heard <= 1:  # the controller may have declared the node lost: it could not tell which side was cut off
+        if (
+            world.received <= 1
+        ):  # the controller may have declared the node lost: it could not tell which side was cut off
             for node in world.cluster.running:
                 node.was_silent = max(node.was_silent, world.machine.time - world.bus_down_since)
 
@@ -141,16 +143,16 @@ def _silence(world: Simulation, rng: Random, how: str) -> None:
     seconds = _seconds(rng)
     world.note(f"{node} is {how} for {seconds:.0f} s")
     setattr(node, how, True)
-    is_alone = world.bus_down and world.heard <= 1  # then the router has not heard it for as long as the bus is down
+    is_alone = world.bus_down and world.received <= 1  # then the router has not heard it for as long as the bus is down
     node.silent_since = world.bus_down_since if is_alone else world.machine.time
     world.notice(node, _LEASE)
 
     def back() -> None:
         setattr(node, how, False)
         node.was_silent = max(node.was_silent, seconds)
-        heard = rng.uniform(0.2, 5.0)
-        world.notice(node, heard)
-        world.machine.after(heard, lambda: setattr(node, "silent_since", None))
+        received = rng.uniform(0.2, 5.0)
+        world.notice(node, received)
+        world.machine.after(received, lambda: setattr(node, "silent_since", None))
 
     world.machine.after(seconds, back)
 

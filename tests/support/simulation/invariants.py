@@ -8,7 +8,7 @@ from orchestrator.control.presence import LOST_AFTER
 from orchestrator.domain.job import TERMINAL, Status
 from orchestrator.engines.api import Gang
 from tests.support.simulation.cluster import SimulatedGang
-from tests.support.simulation.engine import AWAY, HANGS
+from tests.support.simulation.engine import ABSENT, HANGS
 from tests.support.simulation.jobs import SimulatedJob
 from tests.support.simulation.machine import Violation
 from tests.support.simulation.store import NO_VOLUME
@@ -16,7 +16,7 @@ from tests.support.simulation.store import NO_VOLUME
 if TYPE_CHECKING:
     from tests.support.simulation.run import Simulation
 
-_TOLD = 80.0
+_REPORTED = 80.0
 """Seconds within which a controller notices whether its engine and its volume answer: the longest pause between two tries, and some more."""
 _SEEN = 30.0
 """Seconds within which a gang whose engine answers is seen to run, whatever the bus and the store do."""
@@ -61,19 +61,19 @@ class Invariants:
 
     def launched(self, gang: SimulatedGang) -> None:
         """A gang that is to be seen soon."""
-        if not (self._world.engine_away or self._world.database_down):
+        if not (self._world.engine_absent or self._world.database_down):
             self._launched.append(gang)
 
     def check_cause(self, gang: SimulatedGang) -> None:
         """No gang is ended without a cause."""
         job, moment = self._world.job(gang.job), self._world.machine.time
-        if job.stop_asked or not all(node.alive for node in gang.nodes):
+        if job.stop_requested or not all(node.alive for node in gang.nodes):
             return
         if job.timeout is not None and moment - gang.launched > job.timeout - _SLACK:
             return
         silences = [moment - node.silent_since for node in gang.nodes if node.silent_since is not None]
         silences += [node.was_silent for node in gang.nodes]  # the engine may have been away since it was decided
-        if self._world.bus_down and self._world.heard <= 1:
+        if self._world.bus_down and self._world.received <= 1:
             silences.append(
                 moment - self._world.bus_down_since
             )  # it can't be told who is cut off: the node or the router
@@ -106,12 +106,12 @@ class Invariants:
     def _check_end(self, job: SimulatedJob, status: str, reason: str) -> None:
         """Every end is the true end, and a job that failed has spent its attempts."""
         succeeded = any(code == 0 for _, code, _ in job.main_ends)
-        in_time = any(code == 0 and not (asked and job.timeout) for _, code, asked in job.main_ends)
+        in_time = any(code == 0 and not (requested and job.timeout) for _, code, requested in job.main_ends)
         if status == Status.SUCCEEDED and job.name not in self._world.volume.runs:
             raise Violation(f"{job.name} is SUCCEEDED, and the store does not have its run")
         if status == Status.SUCCEEDED and not succeeded:
             raise Violation(f"{job.name} is SUCCEEDED, and its main node did not end with 0: {job.main_ends}")
-        if status != Status.FAILED or job.stop_asked:
+        if status != Status.FAILED or job.stop_requested:
             return
         if in_time:
             raise Violation(f"{job.name} is FAILED ({reason}), and its main node ended with 0: {job.main_ends}")
@@ -139,7 +139,7 @@ class Invariants:
         if state != self._state:
             self._state, self._since, self._is_checked, self._launched = state, world.machine.time, False, []
         self._check_seen()
-        if self._is_checked or world.database_down or world.machine.time - self._since < _TOLD:
+        if self._is_checked or world.database_down or world.machine.time - self._since < _REPORTED:
             return  # without the database no reason can be written
         began, self._is_checked = self._since, True
         self._check_waiting()
@@ -152,40 +152,42 @@ class Invariants:
         ).fetchall()
         for name, reason, running, met in rows:
             job = world.job(name)
-            seen = [gang for gang in world.cluster.gangs.values() if gang.run == name and gang.launched < began - _TOLD]
-            if running is None or not seen or job.stop_asked:
+            seen = [
+                gang for gang in world.cluster.gangs.values() if gang.run == name and gang.launched < began - _REPORTED
+            ]
+            if running is None or not seen or job.stop_requested:
                 continue
-            if world.engine_away and not any(gang.running for gang in seen):
+            if world.engine_absent and not any(gang.running for gang in seen):
                 continue  # the engine is not needed any more
-            if (AWAY in reason or HANGS in reason) != world.engine_away:
+            if (ABSENT in reason or HANGS in reason) != world.engine_absent:
                 raise Violation(
-                    f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_away or 'answers'}"
+                    f"{name} is RUNNING ({reason}), and its engine {'is away' * world.engine_absent or 'answers'}"
                 )
             known = [node for gang in seen for node in gang.nodes if node.index == met and node.alive]
             missing = [node for node in known if not (world.hears(node) or world.met(node))]
-            if missing and not world.engine_away and "unreachable" not in reason:
+            if missing and not world.engine_absent and "unreachable" not in reason:
                 raise Violation(f"{name} is RUNNING ({reason}), and its controller has not met {missing[0]}")
 
     def _check_stops(self, began: float) -> None:
         """A stop that was asked for before ``began`` is decided, whatever the store does, unless the engine is away."""
         world = self._world
-        if world.engine_away:
+        if world.engine_absent:
             return
         query = (
             "SELECT jobs.name FROM jobs JOIN attempts ON attempts.job_id = jobs.id"
             " WHERE jobs.status = 'RUNNING' AND jobs.stop_reason IS NOT NULL AND attempts.ending IS NULL"
         )
         for (name,) in world.memory.execute(query).fetchall():
-            if (asked := world.job(name).stopped_at) is not None and asked < began:
-                raise Violation(f"{name} was asked to stop at {asked:.0f} s, and its end is not decided")
+            if (requested := world.job(name).stopped_at) is not None and requested < began:
+                raise Violation(f"{name} was asked to stop at {requested:.0f} s, and its end is not decided")
 
     def _check_waiting(self) -> None:
         """A job that waits says why, and that the volume is away if that is so, and only then."""
         world = self._world
-        away = world.volume.stalled or world.volume.full or world.volume.absent
+        missing = world.volume.stalled or world.volume.full or world.volume.absent
         for name, reason in world.reasons():
-            if not reason or (NO_VOLUME in reason) != away:
-                raise Violation(f"{name} waits ({reason}), and its volume {'is away' if away else 'answers'}")
+            if not reason or (NO_VOLUME in reason) != missing:
+                raise Violation(f"{name} waits ({reason}), and its volume {'is away' if missing else 'answers'}")
 
     def _check_seen(self) -> None:
         """A gang that runs is RUNNING soon after its launch."""

@@ -39,7 +39,7 @@ class SimulatedJob:
     pulling: float
     """Seconds for which its image is pulled before it can be launched."""
     acknowledged: bool = False
-    stop_asked: bool = False
+    stop_requested: bool = False
     done: float = 0.0
     """Seconds of work that its checkpoints hold."""
     main_ends: list[tuple[int, int, bool]] = field(default_factory=list)

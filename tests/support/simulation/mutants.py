@@ -27,11 +27,11 @@ def silence_alone_counts() -> Mutant:
     """B1: a node counts as dead when it is silent for 20 s, whatever its engine says, and however many others are."""
 
     def silence(self: Presence, node: Node, requested: float | None, runs: bool = True) -> Silence | None:
-        heard = self._nodes.get(node)
-        if heard is None or heard.gone is None:
+        received = self._nodes.get(node)
+        if received is None or received.gone is None:
             return None
-        seconds = self._monotonic() - heard.gone
-        return Silence(seconds, heard.since, seconds > 20.0)
+        seconds = self._monotonic() - received.gone
+        return Silence(seconds, received.since, seconds > 20.0)
 
     return mock.patch.object(Presence, "silence", silence)
 

@@ -90,7 +90,7 @@ class Simulation:
                     self._controller.engines.close()
 
     @property
-    def engine_away(self) -> bool:
+    def engine_absent(self) -> bool:
         """Whether the engine refuses calls, or does not return from them."""
         return self.engine_down or self.engine_hangs
 
@@ -205,7 +205,7 @@ class Simulation:
     # -- the bus ------------------------------------------------------------------------------------------------------
 
     @property
-    def heard(self) -> int:
+    def received(self) -> int:
         """How many nodes the controller's router has met, and does not know to have ended."""
         return len(self._bus.presence._nodes) if self._bus is not None else 0
 
@@ -245,7 +245,7 @@ class Simulation:
     def _ask_to_stop(self, job: SimulatedJob) -> None:
         if not job.acknowledged or self._controller is None:
             return
-        job.stop_asked = True  # also where the answer is lost: then it may count or not
+        job.stop_requested = True  # also where the answer is lost: then it may count or not
         try:
             with self._controller.database.session() as session:
                 ask_to_end(session, Job.id == job.id, "stopped by its user")

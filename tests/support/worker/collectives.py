@@ -20,7 +20,7 @@ import pytest
 WORKER = Path(__file__).resolve().parents[3] / "worker"
 _GANG = re.compile(r"(^|\.)_?gang$")
 """What an expression ends with whose value is a gang. A gang of one may be called ``alone``; :func:`other_names` finds other names."""
-_OF_A_GANG = ("sum", "broadcast", "greatest", "tell", "build_in_turn")
+_OF_A_GANG = ("sum", "broadcast", "greatest", "broadcast_text", "build_in_turn")
 _OF_TORCH = ("init_process_group", "all_reduce", "broadcast", "broadcast_object_list", "all_gather", "barrier")
 _OF_A_STORE = ("set", "get", "wait")
 _OF_RSL_RL = ("broadcast_parameters",)
@@ -74,8 +74,8 @@ class _Module(ast.NodeVisitor):
         self._class.pop()
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        given = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
-        for each in given:
+        supplied = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        for each in supplied:
             if each.annotation and ast.unparse(each.annotation).strip("'\"") == "Gang" and not _GANG.search(each.arg):
                 self.gangs.append(f"{self.file}:{node.name}: {each.arg}")
         self._inside(node, [node.name], ".".join([*self._scope, node.name]), ["<locals>"])
@@ -99,8 +99,8 @@ class _Module(ast.NodeVisitor):
         self.generic_visit(node)
 
     def visit_Call(self, node: ast.Call) -> None:
-        given = [each.id for each in node.args if isinstance(each, ast.Name)]
-        if "alone" not in given and (callee := self._callee(node.func)):
+        supplied = [each.id for each in node.args if isinstance(each, ast.Name)]
+        if "alone" not in supplied and (callee := self._callee(node.func)):
             line = node.func.end_lineno or node.lineno
             call = Call(f"{self.file}:{self._function}", node.lineno, max(line, node.end_lineno or line))
             self.calls.append((call, callee))

@@ -76,7 +76,7 @@ def kick(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, speed:
 
 
 @wp.func
-def far_away(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, limit: float) -> bool:
+def distant(world: int, worlds: WorldArrays, robot: RobotArrays, joint: int, limit: float) -> bool:
     return wp.abs(worlds.joint_q[world, robot.coordinates[joint]]) > limit
 
 
@@ -156,8 +156,8 @@ class Sliders(Task):
             },
             "metrics": {"speed": Metric(terms.joint_speed)},
             "terminations": {
-                "first_left": Termination(far_away, joints="first", limit=1.5),
-                "second_left": Termination(far_away, joints="second", limit=1.5, time_out=True),
+                "first_left": Termination(distant, joints="first", limit=1.5),
+                "second_left": Termination(distant, joints="second", limit=1.5, time_out=True),
             },
             "commands": {
                 "target": Command(target, names=("place",), units=("m",), place=(-1.0, 1.0), seconds=(0.3, 0.5))

@@ -48,8 +48,8 @@ def play_cases(module: str, env: dict[str, str]) -> Played:
     for _, output, errors in ranks:
         for line in output.splitlines():
             if line.startswith('{"case"'):
-                said = json.loads(line)
-                found.setdefault(f"test_{said['case']}", []).append({**said, "errors": errors})
+                message = json.loads(line)
+                found.setdefault(f"test_{message['case']}", []).append({**message, "errors": errors})
     assert [code for code, _, _ in ranks] == [0, 0], ranks
     return found
 
@@ -62,12 +62,12 @@ def play() -> int:
         gang = distributed.connect(RankPlacement.from_env(os.environ))
         for function in importlib.import_module(os.environ["CASES"]).CASES:
             seed_generators(1, gang.rank)
-            told: dict[str, Any] = {}
+            reported: dict[str, Any] = {}
             try:
-                told["result"] = function(gang, Path(os.environ["MUSTER_STORE"]))
+                reported["result"] = function(gang, Path(os.environ["MUSTER_STORE"]))
             except Exception as error:
-                told["error"] = f"{type(error).__name__}: {error}"
-            print("\n" + json.dumps({"case": function.__name__, "seen": sorted(seen), **told}), flush=True)
+                reported["error"] = f"{type(error).__name__}: {error}"
+            print("\n" + json.dumps({"case": function.__name__, "seen": sorted(seen), **reported}), flush=True)
             seen.clear()
             gang.greatest(0)
         gang.close()
@@ -86,7 +86,7 @@ def digest(state: Any) -> str:
 
 
 @contextlib.contextmanager
-def given(gang: Gang, env: dict[str, str]) -> Iterator[None]:
+def supplied(gang: Gang, env: dict[str, str]) -> Iterator[None]:
     """``worker``'s commands have ``env``, find the point task, and are in ``gang``, which they do not close."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("worker.learning.distributed.connect", lambda *_, **__: gang)
@@ -97,7 +97,7 @@ def given(gang: Gang, env: dict[str, str]) -> Iterator[None]:
         yield
 
 
-def begun(gang: Gang, run: Run, epoch: int = 1) -> Run:
+def started(gang: Gang, run: Run, epoch: int = 1) -> Run:
     """The run, given to this attempt as a controller does before it starts one."""
     if gang.is_main:
         raise_epoch(run, epoch)

@@ -30,13 +30,13 @@ def need_mjlab() -> None:
 
 
 def build(
-    *things: Any, worlds: int = 1, ground: bool = True, timestep: float = 0.005, substeps: int = 1, **options: Any
+    *items: Any, worlds: int = 1, ground: bool = True, timestep: float = 0.005, substeps: int = 1, **options: Any
 ) -> tuple[newton.ModelBuilder, Worlds]:
     """A template of these robots and objects, and its worlds on the processor."""
     template = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(template)
-    for thing in things:
-        thing.add_to(template)
+    for item in items:
+        item.add_to(template)
     built = Worlds(
         template,
         worlds,
@@ -96,7 +96,7 @@ def _collide(geom: Any, collision: Collision) -> None:
         setattr(geom, name, _first(geom.name, getattr(collision, name)))
     friction = _first(geom.name, collision.friction)
     if friction is not None:
-        given = np.atleast_1d(friction)
-        geom.friction[: len(given)] = given
+        supplied = np.atleast_1d(friction)
+        geom.friction[: len(supplied)] = supplied
     if collision.solref is not None:
         geom.solref[:2] = collision.solref

@@ -127,8 +127,8 @@ class Reference:
 
     def sensor(self, name: str) -> np.ndarray:
         """What a sensor of the file says."""
-        told: np.ndarray = self.data.sensor(name).data.copy()
-        return told
+        reported: np.ndarray = self.data.sensor(name).data.copy()
+        return reported
 
     def contacts(self) -> list[tuple[str, str, np.ndarray]]:
         """Names of the two geoms of each contact, and the force on the second in the world frame [N]."""

@@ -42,9 +42,9 @@ def terms_of(*groups: str) -> list[str]:
     return [name for group, name, _ in all_terms() if group in groups]
 
 
-def close(found: np.ndarray, wanted: Any, name: str = "", *, rtol: float = 1e-4, atol: float = 2e-5) -> None:
+def close(found: np.ndarray, requested: Any, name: str = "", *, rtol: float = 1e-4, atol: float = 2e-5) -> None:
     """Judge numbers in float32."""
-    np.testing.assert_allclose(found, np.asarray(wanted, dtype=float), rtol=rtol, atol=atol, err_msg=name)
+    np.testing.assert_allclose(found, np.asarray(requested, dtype=float), rtol=rtol, atol=atol, err_msg=name)
 
 
 def rotations(random: np.random.Generator, *shape: int) -> np.ndarray:

@@ -49,9 +49,9 @@ class Twin:
         self.task, self.view = task, task.views["robot"]
         robot = task.walker.robot()
         self.model = reference(robot)
-        options, given = self.model.opt, task.solver_options
-        options.cone = getattr(mujoco.mjtCone, f"mjCONE_{given['cone'].upper()}")
-        options.impratio, options.iterations, options.tolerance = given["impratio"], 200, 1e-12
+        options, supplied = self.model.opt, task.solver_options
+        options.cone = getattr(mujoco.mjtCone, f"mjCONE_{supplied['cone'].upper()}")
+        options.impratio, options.iterations, options.tolerance = supplied["impratio"], 200, 1e-12
         self.data = mujoco.MjData(self.model)
         joints = [self.model.joint(name) for name in self.view.joint_names]
         self.places = [int(joint.qposadr[0]) for joint in joints]
@@ -124,8 +124,8 @@ class Twin:
     def velocity(self, kind: Any, name: str, local: bool) -> tuple[np.ndarray, np.ndarray]:
         """Linear and angular velocity of the origin of a body or site."""
         found = np.zeros(6)
-        thing = mujoco.mj_name2id(self.model, kind, name)
-        mujoco.mj_objectVelocity(self.model, self.data, kind, thing, found, int(local))
+        item = mujoco.mj_name2id(self.model, kind, name)
+        mujoco.mj_objectVelocity(self.model, self.data, kind, item, found, int(local))
         return found[3:], found[:3]
 
     def soles(self) -> tuple[np.ndarray, np.ndarray]:

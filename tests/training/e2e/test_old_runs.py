@@ -100,11 +100,11 @@ def test_a_run_resumed_from_its_middle_ends_with_the_same_bits(
 ) -> None:
     if name == "racer" and "Racer" not in entry_points(group="muster.tasks").names:
         pytest.skip("the racer is not installed: its old runs are untested")
-    run, there, differing = copy_of(archived, served, name), archived.run(name), archived.other_bits()
+    run, existing, differing = copy_of(archived, served, name), archived.run(name), archived.other_bits()
     epoch = resumed_epoch(served, run, middle)
     if differing is None:
-        pairs = [(checkpoint(there, each, 1), checkpoint(run, each, epoch)) for each in (later, last)]
-        before = {record["iteration"]: without_timing(record) for record in read_metrics(there)}
+        pairs = [(checkpoint(existing, each, 1), checkpoint(run, each, epoch)) for each in (later, last)]
+        before = {record["iteration"]: without_timing(record) for record in read_metrics(existing)}
         for record in read_metrics(run):
             old = before[record["iteration"]]
             assert {key: record.get(key) for key in old} == old

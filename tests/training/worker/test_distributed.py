@@ -107,8 +107,8 @@ def report() -> int:
 
 def test_a_missing_main_rank_is_named() -> None:
     placement = RankPlacement(rank=1, world_size=2, master_port=free_port())
-    said = r"rank 1 \(node 1\) could not reach rank 0 \(node 0\) at 127.0.0.1:\d+ within 1 s"
-    with pytest.raises(GangError, match=said):
+    output = r"rank 1 \(node 1\) could not reach rank 0 \(node 0\) at 127.0.0.1:\d+ within 1 s"
+    with pytest.raises(GangError, match=output):
         connect(placement, report_seconds=1.0)
 
 
@@ -238,6 +238,6 @@ def test_a_malformed_placement_is_refused(env: dict[str, str], message: str) -> 
 def test_a_rank_whose_gpu_pytorch_cannot_use_does_not_train_on_the_cpu_in_silence() -> None:
     for none in ("", "-1", "NoDevFiles"):
         require_gpus(none, 0)
-    said = r"this node has GPU 0,1, and PyTorch .* can use none of them; install a PyTorch"
-    with pytest.raises(ValueError, match=said):
+    output = r"this node has GPU 0,1, and PyTorch .* can use none of them; install a PyTorch"
+    with pytest.raises(ValueError, match=output):
         require_gpus("0,1", 1)

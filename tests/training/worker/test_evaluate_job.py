@@ -42,10 +42,10 @@ def environment(
 
 def start(run: Run, section: dict[str, Any], job: str, rank: int = 0, ranks: int = 1, port: int = 0) -> Any:
     """One rank as a process, as the supervisor starts it."""
-    given = environment(run, section, job, rank, ranks, port)
+    supplied = environment(run, section, job, rank, ranks, port)
     command = [sys.executable, "-m", "worker.evaluate"]
     return subprocess.Popen(
-        command, env={**os.environ, **given}, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        command, env={**os.environ, **supplied}, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
 
 
@@ -91,9 +91,9 @@ def test_changed_worlds_an_older_checkpoint_and_another_seed_are_recorded(run: R
     changes = {"episode_seconds": 0.5, "angle_limit": 0.3}
     code, output = evaluate(run, "changed", checkpoint=1, seed=9, episodes=33, worlds=1, config=changes)
     assert code == 0, output
-    (told,) = [each for each in list_evaluations(run) if each["job"] == "changed"]
-    assert (told["iteration"], told["seed"], told["config"], told["max_length"]) == (1, 9, changes, 30)
-    assert told["episodes"] == 33 and told["versions"]["torch"] and "with config.episode_seconds: 0.5" in output
+    (reported,) = [each for each in list_evaluations(run) if each["job"] == "changed"]
+    assert (reported["iteration"], reported["seed"], reported["config"], reported["max_length"]) == (1, 9, changes, 30)
+    assert reported["episodes"] == 33 and reported["versions"]["torch"] and "with config.episode_seconds: 0.5" in output
 
 
 def test_an_evaluation_that_is_asked_to_stop_leaves_with_75_and_records_nothing(run: Run) -> None:
@@ -112,7 +112,7 @@ def test_an_evaluation_that_is_asked_to_stop_leaves_with_75_and_records_nothing(
 
 
 @pytest.mark.parametrize(
-    ("section", "said"),
+    ("section", "message"),
     [
         ({"episodes": 0}, "episodes: expected an integer of at least 1, got 0"),
         (
@@ -121,6 +121,6 @@ def test_an_evaluation_that_is_asked_to_stop_leaves_with_75_and_records_nothing(
         ),
     ],
 )
-def test_what_came_without_a_check_at_submission_is_refused_in_one_line(run: Run, section: Any, said: str) -> None:
+def test_what_came_without_a_check_at_submission_is_refused_in_one_line(run: Run, section: Any, message: str) -> None:
     code, output = evaluate(run, "wrong", **section)
-    assert code == 2 and f"error: {said}" in output and "Traceback" not in output
+    assert code == 2 and f"error: {message}" in output and "Traceback" not in output

@@ -58,7 +58,7 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (("export", "RUN@7"), "run RUN has no checkpoint of iteration 7; the nearest is 2; it has: 1, 2"),
         (("export", "RUNX"), "did you mean RUN?"),
@@ -72,8 +72,8 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
         (("models", "verify", "cart@0"), "cart@0: expected a version after @, such as cart@1"),
     ],
 )
-def test_wrong_use_is_one_line(home: Path, arguments: tuple[str, ...], said: str) -> None:
+def test_wrong_use_is_one_line(home: Path, arguments: tuple[str, ...], output: str) -> None:
     run = run_in(home)
     done = call_muster(*(each.replace("RUN", run.name) for each in arguments), home=home)
     (line,) = done.stderr.strip().splitlines()
-    assert done.returncode != 0 and said.replace("RUN", run.name) in line, done.stdout + done.stderr
+    assert done.returncode != 0 and output.replace("RUN", run.name) in line, done.stdout + done.stderr

@@ -15,7 +15,7 @@ from shared_store.volume.evaluations import list_evaluations
 from shared_store.volume.layout import Run, Store
 from tests.support.worker.clones import make_clone
 from tests.support.worker.collectives import ALONE, TESTS, paths
-from tests.support.worker.gangs import Played, begun, case, digest, given, play_cases
+from tests.support.worker.gangs import Played, case, digest, play_cases, started, supplied
 from tests.support.worker.loop import alone, iterate
 from tests.support.worker.motion_task import Turning, motion
 from tests.support.worker.point_task import Point, PointConfig, PointPPO, Tripping
@@ -45,7 +45,7 @@ def played(store: Path) -> Played:
 
 
 @pytest.fixture
-def told(played: Played, request: pytest.FixtureRequest) -> list[Any]:
+def reported(played: Played, request: pytest.FixtureRequest) -> list[Any]:
     """What both ranks returned from the case of this test, or the error that both raised."""
     name = request.node.name
     first, second = played[name]
@@ -74,13 +74,13 @@ def test_every_path_was_taken_by_two_ranks(played: Played) -> None:
 def a_training_is_the_same_on_all_ranks_to_its_end(gang: Gang, store: Path) -> Any:
     from worker import train
 
-    begun(gang, Store(store).run("taught"))
-    with given(gang, {**training(store, run="taught", iterations=2, every=1), "MUSTER_WORLDS": str(WORLDS)}):
+    started(gang, Store(store).run("taught"))
+    with supplied(gang, {**training(store, run="taught", iterations=2, every=1), "MUSTER_WORLDS": str(WORLDS)}):
         return train.main()
 
 
-def test_a_training_is_the_same_on_all_ranks_to_its_end(told: list[Any], store: Path) -> None:
-    assert told == [0, 0]
+def test_a_training_is_the_same_on_all_ranks_to_its_end(reported: list[Any], store: Path) -> None:
+    assert reported == [0, 0]
     run = Store(store).run("taught")
     assert [each.name for each in list_checkpoints(run)] == ["00000001-e1", "00000002-e1"]
     assert list_checkpoints(run)[-1].manifest["shards"] == [[0, 3], [3, 4]]
@@ -94,13 +94,13 @@ def an_evaluation_has_the_episodes_of_all_ranks_in_every_round(gang: Gang, store
     section = {"run": "taught", "episodes": 70, "checkpoint": 1, "config": {"randomize": {"mass": [0.5, 2.0]}}}
     spec = {"name": "evaluate", "evaluate": section}
     env = {**training(store, run="judge"), "MUSTER_SPEC": json.dumps(spec), "MUSTER_JOB_ID": f"of-{gang.size}"}
-    with given(gang, env):
+    with supplied(gang, env):
         return evaluate.main()
 
 
-def test_an_evaluation_has_the_episodes_of_all_ranks_in_every_round(told: list[Any], store: Path) -> None:
+def test_an_evaluation_has_the_episodes_of_all_ranks_in_every_round(reported: list[Any], store: Path) -> None:
     """Two rounds of 64 worlds, each built anew; one rank alone plays the same episodes."""
-    assert told == [0, 0]
+    assert reported == [0, 0]
     assert an_evaluation_has_the_episodes_of_all_ranks_in_every_round(alone(), store) == 0
     one, two = ((Store(store).run("taught").evaluations / f"00000001-e1-of-{n}.parquet").read_bytes() for n in (1, 2))
     assert one == two
@@ -110,12 +110,12 @@ def test_an_evaluation_has_the_episodes_of_all_ranks_in_every_round(told: list[A
 def a_request_to_leave_that_one_rank_has_got_ends_all_with_a_checkpoint(gang: Gang, store: Path) -> Any:
     stop = StopRequest()
     stop.requested = gang.rank == 1
-    begun(gang, Store(store).run("stopped"))
+    started(gang, Store(store).run("stopped"))
     return runner(training(store, run="stopped"), gang, stop).train()
 
 
-def test_a_request_to_leave_that_one_rank_has_got_ends_all_with_a_checkpoint(told: list[Any], store: Path) -> None:
-    assert told == [75, 75]
+def test_a_request_to_leave_that_one_rank_has_got_ends_all_with_a_checkpoint(reported: list[Any], store: Path) -> None:
+    assert reported == [75, 75]
     assert [each.name for each in list_checkpoints(Store(store).run("stopped"))] == ["00000001-e1"]
 
 
@@ -138,18 +138,18 @@ def episodes_are_played_until_the_last_one_of_any_rank_has_ended(gang: Gang, sto
     return play(tasks, Still(), gang).rows.tolist()
 
 
-def test_episodes_are_played_until_the_last_one_of_any_rank_has_ended(told: list[Any]) -> None:
-    assert told[0] == told[1] and len(told[0]) == 2 * WORLDS
-    assert [row[1] for row in told[0]] == [50.0] * 3 + [1.0] * 4 + [1.0] * 7, "steps of each episode"
+def test_episodes_are_played_until_the_last_one_of_any_rank_has_ended(reported: list[Any]) -> None:
+    assert reported[0] == reported[1] and len(reported[0]) == 2 * WORLDS
+    assert [row[1] for row in reported[0]] == [50.0] * 3 + [1.0] * 4 + [1.0] * 7, "steps of each episode"
 
 
 @case
-def an_evaluation_that_one_rank_is_asked_to_leave_ends_on_all(gang: Gang, store: Path) -> Any:
+def an_evaluation_that_one_rank_is_requested_to_leave_ends_on_all(gang: Gang, store: Path) -> Any:
     play([Point(PointConfig(episode_seconds=5.0), 3)], Still(), gang, is_stop_requested=lambda: gang.rank == 1)
 
 
-def test_an_evaluation_that_one_rank_is_asked_to_leave_ends_on_all(told: list[Any]) -> None:
-    assert told == ["Stopped: "] * 2
+def test_an_evaluation_that_one_rank_is_asked_to_leave_ends_on_all(reported: list[Any]) -> None:
+    assert reported == ["Stopped: "] * 2
 
 
 # -- where a run begins -----------------------------------------------------------------------------------------------
@@ -157,51 +157,53 @@ def test_an_evaluation_that_one_rank_is_asked_to_leave_ends_on_all(told: list[An
 
 @case
 def a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read(gang: Gang, store: Path) -> Any:
-    run = begun(gang, Store(store).run("resumed"))
+    run = started(gang, Store(store).run("resumed"))
     train(training(store, run="resumed", iterations=3, every=1), gang)
     if gang.is_main:
         (list_checkpoints(run)[-1].path / "learner.pt").write_bytes(b"")
-    begun(gang, run, 2)
+    started(gang, run, 2)
     again = runner(training(store, run="resumed", epoch=2), gang)
     return [again.resumed and again.resumed.name, digest(again.algorithm.state_dict()), again.state.progress.iteration]
 
 
-def test_a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read(told: list[Any]) -> None:
-    assert told[0] == told[1] and told[0][::2] == ["00000002-e1", 2]
+def test_a_resumed_gang_takes_the_newest_checkpoint_that_can_be_read(reported: list[Any]) -> None:
+    assert reported[0] == reported[1] and reported[0][::2] == ["00000002-e1", 2]
 
 
 @case
 def a_chosen_checkpoint_that_is_gone_is_refused_by_all_ranks(gang: Gang, store: Path) -> Any:
-    begun(gang, Store(store).run("resumed"), 3)
+    started(gang, Store(store).run("resumed"), 3)
     runner(training(store, run="resumed", epoch=3, MUSTER_CHECKPOINT="00000009-e1", MUSTER_JOB_EPOCH=3), gang)
 
 
-def test_a_chosen_checkpoint_that_is_gone_is_refused_by_all_ranks(told: list[Any]) -> None:
-    assert told[0] == told[1] and told[0].startswith("DamagedCheckpoint: ") and "00000009-e1" in told[0]
+def test_a_chosen_checkpoint_that_is_gone_is_refused_by_all_ranks(reported: list[Any]) -> None:
+    assert reported[0] == reported[1] and reported[0].startswith("DamagedCheckpoint: ") and "00000009-e1" in reported[0]
 
 
 @case
 def a_clone_begins_with_the_same_weights_on_all_ranks(gang: Gang, store: Path) -> Any:
     if gang.is_main:
         make_clone(store, "clone", "taught")
-    begun(gang, Store(store).run("clone"))
+    started(gang, Store(store).run("clone"))
     clone = runner(training(store, run="clone"), gang)
     return [clone.adopted and clone.adopted.name, digest(clone.algorithm.state_dict()["policy"])]
 
 
-def test_a_clone_begins_with_the_same_weights_on_all_ranks(told: list[Any], store: Path) -> None:
+def test_a_clone_begins_with_the_same_weights_on_all_ranks(reported: list[Any], store: Path) -> None:
     learnt = torch.load(list_checkpoints(Store(store).run("taught"))[-1].path / "learner.pt", weights_only=True)
-    assert told == [["00000002-e1", digest(learnt["algorithm"]["policy"])]] * 2
+    assert reported == [["00000002-e1", digest(learnt["algorithm"]["policy"])]] * 2
 
 
 @case
-def a_clone_whose_weights_are_gone_is_refused_by_all_ranks(gang: Gang, store: Path) -> Any:
-    begun(gang, Store(store).run("orphan"))
+def a_clone_owner_weights_are_gone_is_refused_by_all_ranks(gang: Gang, store: Path) -> Any:
+    started(gang, Store(store).run("orphan"))
     runner(training(store, run="orphan", MUSTER_PARENT="taught"), gang)
 
 
-def test_a_clone_whose_weights_are_gone_is_refused_by_all_ranks(told: list[Any]) -> None:
-    assert told[0] == told[1] and told[0].startswith("UserError: run orphan can't begin with the weights of taught")
+def test_a_clone_whose_weights_are_gone_is_refused_by_all_ranks(reported: list[Any]) -> None:
+    assert reported[0] == reported[1] and reported[0].startswith(
+        "UserError: run orphan can't begin with the weights of taught"
+    )
 
 
 class Pupil(PPO):
@@ -215,7 +217,7 @@ class Pupil(PPO):
 
 
 def learnt_by(gang: Gang, store: Path, run: str, epoch: int = 1) -> str:
-    begun(gang, Store(store).run(run), epoch)
+    started(gang, Store(store).run(run), epoch)
     algorithm = {"algorithm": "tests.training.worker.test_gangs:Pupil", "settings": {"steps": 8}}
     return str(runner(training(store, run=run, epoch=epoch, **algorithm), gang).algorithm.learnt)  # type: ignore[attr-defined]
 
@@ -229,9 +231,9 @@ def all_ranks_have_the_teacher_whether_it_was_copied_or_not(gang: Gang, store: P
     return [learnt_by(gang, store, run) for run in ("copied", "not-copied")]
 
 
-def test_all_ranks_have_the_teacher_whether_it_was_copied_or_not(told: list[Any], store: Path) -> None:
+def test_all_ranks_have_the_teacher_whether_it_was_copied_or_not(reported: list[Any], store: Path) -> None:
     learnt = torch.load(list_checkpoints(Store(store).run("taught"))[0].path / "learner.pt", weights_only=True)
-    assert told == [[digest(learnt["algorithm"]["policy"])] * 2] * 2
+    assert reported == [[digest(learnt["algorithm"]["policy"])] * 2] * 2
 
 
 @case
@@ -242,8 +244,8 @@ def a_teacher_that_is_missing_is_refused_by_all_ranks(gang: Gang, store: Path) -
     learnt_by(gang, store, "copied", epoch=2)
 
 
-def test_a_teacher_that_is_missing_is_refused_by_all_ranks(told: list[Any]) -> None:
-    assert told == ["UserError: run taught has no checkpoint 1; there are: none"] * 2
+def test_a_teacher_that_is_missing_is_refused_by_all_ranks(reported: list[Any]) -> None:
+    assert reported == ["UserError: run taught has no checkpoint 1; there are: none"] * 2
 
 
 @case
@@ -251,13 +253,13 @@ def worlds_that_do_not_fit_are_refused_by_all_ranks(gang: Gang, store: Path) -> 
     from worker import train
 
     env = training(store, run="large", worlds=10**6)
-    with given(gang, env), pytest.MonkeyPatch.context() as patch:
+    with supplied(gang, env), pytest.MonkeyPatch.context() as patch:
         patch.setattr("worker.learning.memory_estimate.free_bytes", lambda _: 10**6)
         train.main()
 
 
-def test_worlds_that_do_not_fit_are_refused_by_all_ranks(told: list[Any]) -> None:
-    for rank, each in enumerate(told):
+def test_worlds_that_do_not_fit_are_refused_by_all_ranks(reported: list[Any]) -> None:
+    for rank, each in enumerate(reported):
         assert each.startswith(f"UserError: worlds: 1,000,000 worlds of Point on rank {rank} need more memory than")
 
 
@@ -271,8 +273,8 @@ def worlds_that_turn_out_not_to_fit_are_measured_by_all_ranks(gang: Gang, store:
             raise MemoryError
 
 
-def test_worlds_that_turn_out_not_to_fit_are_measured_by_all_ranks(told: list[Any]) -> None:
-    assert all(each.startswith("UserError: worlds: 4 worlds of Point on rank ") for each in told)
+def test_worlds_that_turn_out_not_to_fit_are_measured_by_all_ranks(reported: list[Any]) -> None:
+    assert all(each.startswith("UserError: worlds: 4 worlds of Point on rank ") for each in reported)
 
 
 # -- how a run ends ---------------------------------------------------------------------------------------------------
@@ -280,19 +282,19 @@ def test_worlds_that_turn_out_not_to_fit_are_measured_by_all_ranks(told: list[An
 
 @case
 def worlds_drawn_at_random_are_built_anew_for_the_evaluation(gang: Gang, store: Path) -> Any:
-    begun(gang, Store(store).run("drawn"))
+    started(gang, Store(store).run("drawn"))
     loop = train(training(store, run="drawn", iterations=1, config={"randomize": {"mass": [0.5, 2.0]}}), gang)
     return digest(loop.algorithm.state_dict())
 
 
-def test_worlds_drawn_at_random_are_built_anew_for_the_evaluation(told: list[Any], store: Path) -> None:
-    assert told[0] == told[1]
+def test_worlds_drawn_at_random_are_built_anew_for_the_evaluation(reported: list[Any], store: Path) -> None:
+    assert reported[0] == reported[1]
     assert list_evaluations(Store(store).run("drawn"))[0]["episodes"] == 16
 
 
 @case
 def a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop(gang: Gang, store: Path) -> Any:
-    begun(gang, Store(store).run("unsaved"))
+    started(gang, Store(store).run("unsaved"))
     stop = StopRequest()
     loop = runner(training(store, run="unsaved", iterations=1), gang, stop)
     if gang.rank == 1:
@@ -301,29 +303,33 @@ def a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop(gang: 
         loop.state.saver.run = Run(file)
         order = loop.state.save
 
-        def save(*given: Any, **named: Any) -> None:
+        def save(*supplied: Any, **named: Any) -> None:
             stop.requested = loop.state.ordered_at == 1  # in the second try
-            order(*given, **named)
+            order(*supplied, **named)
 
         loop.state.save = save  # type: ignore[method-assign]
     loop.train()
 
 
-def test_a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop(told: list[Any], store: Path) -> None:
-    assert told[0] == told[1] and told[0].startswith("TrainingError: training is done, but its last checkpoint")
+def test_a_last_save_that_fails_on_one_rank_is_tried_again_by_all_until_a_stop(
+    reported: list[Any], store: Path
+) -> None:
+    assert reported[0] == reported[1] and reported[0].startswith(
+        "TrainingError: training is done, but its last checkpoint"
+    )
     assert not list_checkpoints(Store(store).run("unsaved"))
 
 
 @case
 def a_loss_that_is_not_finite_ends_all_ranks_after_their_saves(gang: Gang, store: Path) -> Any:
-    begun(gang, Store(store).run("poisoned"))
+    started(gang, Store(store).run("poisoned"))
     config = {"poison_at": 9}  # in the second iteration
     runner(training(store, run="poisoned", every=1, config=config), gang).train()
 
 
-def test_a_loss_that_is_not_finite_ends_all_ranks_after_their_saves(told: list[Any], store: Path) -> None:
-    assert told[0].startswith("TrainingError: iteration 2: the loss is not finite")
-    assert "; checkpoint 00000001-e1 stands." in told[0] and "; there is no checkpoint yet." in told[1]
+def test_a_loss_that_is_not_finite_ends_all_ranks_after_their_saves(reported: list[Any], store: Path) -> None:
+    assert reported[0].startswith("TrainingError: iteration 2: the loss is not finite")
+    assert "; checkpoint 00000001-e1 stands." in reported[0] and "; there is no checkpoint yet." in reported[1]
     assert [each.name for each in list_checkpoints(Store(store).run("poisoned"))] == ["00000001-e1"]
 
 
@@ -332,22 +338,22 @@ def too_many_resets_on_one_rank_end_all_after_it_has_written_why(gang: Gang, sto
     from worker.learning.loop import Loop
     from worker.learning.training import Training
 
-    begun(gang, Store(store).run("tripping"))
+    started(gang, Store(store).run("tripping"))
     job = Job.from_env(training(store, run="tripping", config={"nan_limit": 0.0}), "train")
     Loop(Training.of(job, Tripping), gang, StopRequest()).train()  # type: ignore[arg-type]
 
 
-def test_too_many_resets_on_one_rank_end_all_after_it_has_written_why(told: list[Any], store: Path) -> None:
+def test_too_many_resets_on_one_rank_end_all_after_it_has_written_why(reported: list[Any], store: Path) -> None:
     (written,) = Store(store).run("tripping").incidents.iterdir()
     assert written.name == "00000001-rank-1.pt"
-    for each in told:
+    for each in reported:
         assert each.startswith("TrainingError: iteration 1: 8 resets of worlds, among them world 15: it tripped; ")
         assert each.endswith(f"worker.repeat_incident {written}")
 
 
 @case
 def start_frames_follow_the_failures_of_all_ranks(gang: Gang, store: Path) -> Any:
-    begun(gang, Store(store).run("turning"))
+    started(gang, Store(store).run("turning"))
     Turning.motion = motion(store / f"turning-{gang.rank}.npz")
     name = f"{Turning.__module__}:{Turning.__qualname__}"
     loop = runner(training(store, run="turning", worlds=8, iterations=3, task=name), gang, task=Turning)
@@ -357,8 +363,8 @@ def start_frames_follow_the_failures_of_all_ranks(gang: Gang, store: Path) -> An
     return {"own": own, "others": loop.incident._others["motion"].tolist()}
 
 
-def test_start_frames_follow_the_failures_of_all_ranks(told: list[Any]) -> None:
-    first, second = told
+def test_start_frames_follow_the_failures_of_all_ranks(reported: list[Any]) -> None:
+    first, second = reported
     assert first["others"] == second["own"] and second["others"] == first["own"]
     assert first["own"] != second["own"] and min(sum(first["own"]), sum(second["own"])) > 0
 
@@ -381,9 +387,9 @@ def sac_has_the_same_learner_and_metrics_on_all_ranks_and_each_its_own_worlds(ga
     return {"learnt": learnt, "replay": digest(algorithm.world_state())}
 
 
-def test_sac_has_the_same_learner_and_metrics_on_all_ranks_and_each_its_own_worlds(told: list[Any]) -> None:
-    assert told[0]["learnt"] == told[1]["learnt"] and told[0]["learnt"][1]["critic_loss"] > 0
-    assert told[0]["replay"] != told[1]["replay"]
+def test_sac_has_the_same_learner_and_metrics_on_all_ranks_and_each_its_own_worlds(reported: list[Any]) -> None:
+    assert reported[0]["learnt"] == reported[1]["learnt"] and reported[0]["learnt"][1]["critic_loss"] > 0
+    assert reported[0]["replay"] != reported[1]["replay"]
 
 
 ITERATIONS = 3
@@ -415,9 +421,9 @@ def rsl_rl_has_the_same_weights_normalizers_and_metrics_on_all_ranks(gang: Gang,
     return found
 
 
-def test_rsl_rl_has_the_same_weights_normalizers_and_metrics_on_all_ranks(told: list[Any]) -> None:
-    for name in told[0]:
-        one, other = (each[name] for each in told)
+def test_rsl_rl_has_the_same_weights_normalizers_and_metrics_on_all_ranks(reported: list[Any]) -> None:
+    for name in reported[0]:
+        one, other = (each[name] for each in reported)
         assert one["records"] == other["records"], name
         assert one["learnt"] == other["learnt"], name
         assert one["drawn"] != other["drawn"], "each draws its own actions"

@@ -91,6 +91,6 @@ def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_pat
 )
 def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: Path, ppo: dict, camera: dict) -> None:
     env = training(tmp_path, worlds=4, task="CartpolePixels", config={"camera": camera}, ppo=ppo)
-    said = r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
-    with pytest.raises(UserError, match=said):
+    output = r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
+    with pytest.raises(UserError, match=output):
         runner(env, task=CartpolePixels)

@@ -86,8 +86,8 @@ def direct(path: Path) -> list[float]:
 def test_the_node_reaches_the_return_of_the_direct_evaluation_in_real_time(
     exported: Path, tmp_path: Path, trigger: str
 ) -> None:
-    wanted = direct(exported)
-    assert min(wanted) > 0.85 * SECONDS * 6.0, "a policy that balances earns up to 6 a second"
+    requested = direct(exported)
+    assert min(requested) > 0.85 * SECONDS * 6.0, "a policy that balances earns up to 6 a second"
     with socket.socket() as listening:
         listening.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{listening.getsockname()[1]}"
@@ -113,12 +113,12 @@ def test_the_node_reaches_the_return_of_the_direct_evaluation_in_real_time(
     finally:
         process.send_signal(signal.SIGTERM)
         assert process.wait(30 * PATIENCE) == 0
-    said = log.read_text()
-    last = said.splitlines()[-1]
-    assert " 0 messages ignored" in last and f" {times * EPISODES} resets" in last, said
+    output = log.read_text()
+    last = output.splitlines()[-1]
+    assert " 0 messages ignored" in last and f" {times * EPISODES} resets" in last, output
     assert len(lines) == EPISODES + 2
     # a command now and then comes a control step later on a machine that others use, too
-    assert found == pytest.approx(wanted, rel=0.05), said
+    assert found == pytest.approx(requested, rel=0.05), output
 
 
 def test_the_node_sees_a_camera_s_images_as_the_task_does() -> None:

@@ -158,22 +158,22 @@ def test_noise_has_its_deviation_and_leaves_the_simulation_alone() -> None:
 
 def test_controls_are_late_by_each_episode_s_latency() -> None:
     task = Quadruped(QuadrupedConfig(randomize={"action_latency": 3}, action_scale=1.0, stand_thigh=0.0), 64, seed=1)
-    asked, given = [], []
+    requested, supplied = [], []
     for step in range(8):
         task.step(torch.full((64, 12), 0.1 * step))
         assert not task.dones.any()
-        asked.append(0.1 * step)
-        given.append(wp.to_torch(task.worlds.arrays.controls)[:, 1].clone())
+        requested.append(0.1 * step)
+        supplied.append(wp.to_torch(task.worlds.arrays.controls)[:, 1].clone())
     delays = task.state_dict()["control_delays"]
     assert set(delays.tolist()) == {0, 1, 2, 3}
     for world, delay in enumerate(delays.tolist()):
-        expected = [asked[max(0, step - delay)] for step in range(8)]
-        assert [values[world].item() for values in given] == pytest.approx(expected, abs=1e-6)
+        expected = [requested[max(0, step - delay)] for step in range(8)]
+        assert [values[world].item() for values in supplied] == pytest.approx(expected, abs=1e-6)
     assert torch.allclose(task.observations[:, 36:], torch.tensor(0.7)), "the policy sees what it asked for"
     task.reset()
     task.step(torch.full((64, 12), -0.5))
-    given = wp.to_torch(task.worlds.arrays.controls)[:, 1]
-    assert torch.allclose(given, torch.tensor(-0.5)), "nothing of the old episode"
+    supplied = wp.to_torch(task.worlds.arrays.controls)[:, 1]
+    assert torch.allclose(supplied, torch.tensor(-0.5)), "nothing of the old episode"
     assert not torch.equal(task.state_dict()["control_delays"], delays)
 
 
@@ -209,8 +209,8 @@ def test_a_state_brings_the_physics_of_its_worlds_also_that_of_an_older_version(
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(randomize: object, message: str) -> None:
-    said = refusal(configure, Ant, {"config": {"randomize": randomize}}, error=UserError)
-    assert said.startswith(f"train.config.randomize{message}")
+    output = refusal(configure, Ant, {"config": {"randomize": randomize}}, error=UserError)
+    assert output.startswith(f"train.config.randomize{message}")
 
 
 def test_a_robot_that_is_fixed_is_not_pushed() -> None:

@@ -186,9 +186,9 @@ def test_a_recording_that_was_killed_is_recovered_with_all_that_was_flushed(tmp_
     script = "import sys; from pathlib import Path; from tests.training.worker.test_recording import record_for_ever; "
     command = [sys.executable, "-c", f"{script}record_for_ever(Path(sys.argv[1]))", str(path)]
     process = subprocess.Popen(command, cwd=REPOSITORY, stdout=subprocess.DEVNULL)
-    begun = wait_for(lambda: partial.exists() and partial.stat().st_size, 60, "the recording's begin")
+    started = wait_for(lambda: partial.exists() and partial.stat().st_size, 60, "the recording's begin")
     size = lambda: partial.stat().st_size  # noqa: E731
-    flushed = wait_for(lambda: size() > begun + 20_000 and size(), 60, "some steps that were flushed")
+    flushed = wait_for(lambda: size() > started + 20_000 and size(), 60, "some steps that were flushed")
     process.send_signal(signal.SIGKILL)
     process.wait()
     assert not path.exists()
@@ -223,9 +223,9 @@ def test_a_recording_for_which_there_is_no_space_says_so_in_one_line_and_keeps_w
             record_for_ever(tmp_path / "full.mcap")
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    said = str(refused.value)
-    assert "full.mcap.partial: it can't be written (File too large)" in said and "muster record --recover" in said
-    assert "\n" not in said
+    output = str(refused.value)
+    assert "full.mcap.partial: it can't be written (File too large)" in output and "muster record --recover" in output
+    assert "\n" not in output
     made = recover(tmp_path / "full.mcap.partial")
     assert made is not None and made.path == tmp_path / "full.mcap" and made.messages > 20 and not made.losses
     assert not os.path.exists(tmp_path / ".full.mcap.tmp")

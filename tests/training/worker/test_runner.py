@@ -146,8 +146,8 @@ def test_a_checkpoint_that_is_ordered_late_names_the_adaptive_steps_of_its_own_i
     assert loop.task.adapting is not None and loop.task.adapting.steps == {"kicks": 3.0}
     for checkpoint in list_checkpoints(Store(tmp_path).run("run")):
         worlds = torch.load(checkpoint.path / "rank-0.pt", weights_only=True)["worlds"]["state"]
-        begun, step = worlds["adaptive_numbers"][0].tolist()
-        assert (begun, step) == (checkpoint.iteration - 1, checkpoint.manifest["adaptive_steps"]["kicks"])
+        started, step = worlds["adaptive_numbers"][0].tolist()
+        assert (started, step) == (checkpoint.iteration - 1, checkpoint.manifest["adaptive_steps"]["kicks"])
         assert step == checkpoint.iteration - 1
 
 
@@ -175,8 +175,8 @@ def test_a_finished_run_has_all_its_files(tmp_path: Path, capsys: pytest.Capture
     result = json.loads((run.evaluations / "00000003-e1.json").read_text())
     assert result["episodes"] == 8 and result["max_length"] == 20 and 0 < result["mean_length"] <= 20
     record = read_metrics(run)[-1]
-    wanted = "env_steps reward episode_length steps_per_second collect_seconds learn_seconds iteration_seconds learning_rate kl"
-    assert {*wanted.split(), "value_loss", "surrogate_loss", "entropy", "action_std", "time"} <= record.keys()
+    requested = "env_steps reward episode_length steps_per_second collect_seconds learn_seconds iteration_seconds learning_rate kl"
+    assert {*requested.split(), "value_loss", "surrogate_loss", "entropy", "action_std", "time"} <= record.keys()
     assert record["entropy"] == pytest.approx(1.4189 + torch.log(torch.tensor(record["action_std"])).item(), abs=0.02)
 
 
@@ -248,8 +248,8 @@ def test_user_errors_are_one_line_and_reach_the_supervisor(
     tmp_path: Path, command: str, spec: dict | None, message: str, code: int
 ) -> None:
     errors = tmp_path / "error.json"
-    given = {"TORCHELASTIC_ERROR_FILE": str(errors), "MUSTER_SPEC": json.dumps(spec) if spec else ""}
-    env = {**training(tmp_path), **given}
+    supplied = {"TORCHELASTIC_ERROR_FILE": str(errors), "MUSTER_SPEC": json.dumps(spec) if spec else ""}
+    env = {**training(tmp_path), **supplied}
     done = call_worker({"train": worker.train.main, "export": worker.export.main}[command], env)
     assert done.returncode == code
     (line,) = done.stderr.strip().splitlines()
@@ -313,11 +313,11 @@ def test_an_exported_policy_computes_the_same(tmp_path: Path, monkeypatch: pytes
     contract = json.loads((target / "contract.json").read_text())
     assert contract == json.loads(run.contract.read_text()) == checkpoint.manifest["contract"]
     assert contract["groups"][0]["terms"][1]["names"] == ["velocity"] and contract["control_hz"] == 10.0
-    told = np.load(target / "parity.npz")
+    reported = np.load(target / "parity.npz")
     session = onnxruntime.InferenceSession(target / "policy.onnx", providers=["CPUExecutionProvider"])
-    (actions,) = session.run(None, {"obs": told["obs"][0]})
-    np.testing.assert_allclose(actions, told["actions"][0], atol=1e-5)
-    ours = started.algorithm.policy().act({"policy": torch.from_numpy(told["obs"][0])}).numpy()
+    (actions,) = session.run(None, {"obs": reported["obs"][0]})
+    np.testing.assert_allclose(actions, reported["actions"][0], atol=1e-5)
+    ours = started.algorithm.policy().act({"policy": torch.from_numpy(reported["obs"][0])}).numpy()
     np.testing.assert_allclose(actions, ours, atol=1e-5)
     facts = json.loads((target / "manifest.json").read_text())
     assert (facts["checkpoint"], facts["iteration"]) == (checkpoint.name, 2)
@@ -343,8 +343,8 @@ def test_a_training_reports_its_phases_in_their_order(tmp_path: Path, monkeypatc
     train(training(tmp_path, run="run", iterations=2))
     os.close(write)
     with os.fdopen(read) as messages:
-        told = [json.loads(line) for line in messages]
-    phases = [Phase(each["phase"]) if "phase" in each else each.get("iteration") for each in told]
+        reported = [json.loads(line) for line in messages]
+    phases = [Phase(each["phase"]) if "phase" in each else each.get("iteration") for each in reported]
     phases = [each for each in phases if each is not None]
     at_the_end = [Phase.SAVING, Phase.EVALUATING, Phase.WRITING]
     assert phases == [Phase.BUILDING, Phase.TRAINING, 1, 2, *at_the_end]

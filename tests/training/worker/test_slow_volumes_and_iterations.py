@@ -80,8 +80,8 @@ def test_training_goes_on_while_the_volume_hangs_and_what_was_written_comes_afte
         assert all(each.iteration <= len(records) for each in list_checkpoints(run)), "no commit before its records"
         records += read_all(descriptor, ended)
     assert codes == [0]
-    told = [each["iteration"] for each in records if "iteration" in each]
-    assert told == list(range(1, ITERATIONS + 1)), "every record came, in order"
+    reported = [each["iteration"] for each in records if "iteration" in each]
+    assert reported == list(range(1, ITERATIONS + 1)), "every record came, in order"
     assert list_checkpoints(run)[-1].iteration == ITERATIONS
 
 
@@ -124,9 +124,9 @@ def stopped_after(ranks: list[subprocess.Popen[str]], iteration: int) -> str:
     """Ask all ranks to stop when the first one has told of an iteration; the first one's output."""
     try:
         assert ranks[0].stdout
-        said = []
+        output = []
         for line in ranks[0].stdout:
-            said.append(line)
+            output.append(line)
             if line.startswith(f"iteration {iteration}/"):
                 break
         for rank in ranks:
@@ -135,7 +135,7 @@ def stopped_after(ranks: list[subprocess.Popen[str]], iteration: int) -> str:
     finally:
         for rank in ranks:
             rank.kill()
-    return "".join(said) + "".join(out + errors for out, errors in ends)
+    return "".join(output) + "".join(out + errors for out, errors in ends)
 
 
 def test_short_iterations_are_saved_when_the_job_says_so_alone(tmp_path: Path) -> None:

@@ -165,15 +165,15 @@ def test_a_training_answers_a_request_between_two_iterations_and_stops_when_the_
     assert not tap.before_iteration()
     write_json(request_of(run), {"host": socket.gethostname(), "process": os.getpid(), "worlds": 40})
     assert wait_for(tap.before_iteration, 10, "the request")
-    told = wait_for(lambda: read_json(response_of(run)), 10, "the answer")
-    layout = Layout.from_json(told["layout"])
+    reported = wait_for(lambda: read_json(response_of(run)), 10, "the answer")
+    layout = Layout.from_json(reported["layout"])
     assert layout.worlds == 6 and stat.S_IMODE(response_of(run).stat().st_mode) == 0o600
-    segment = Segment.open(Path(told["path"]), layout)
+    segment = Segment.open(Path(reported["path"]), layout)
     task.step(drawn(1))
     (rows,) = wait_for(lambda: list(segment.take()), 10, "the row")
     np.testing.assert_array_equal(rows.actions[0], drawn(1).numpy())
     tap.close()
-    assert segment.closed and not Path(told["path"]).exists() and not response_of(run).exists()
+    assert segment.closed and not Path(reported["path"]).exists() and not response_of(run).exists()
     task.watch(None)
 
 
@@ -185,7 +185,7 @@ def test_a_request_from_another_machine_is_answered_with_the_reason(
     tap = LiveTap()
     tap.serve(run, task, Gate())
     write_json(request_of(run), {"host": "elsewhere", "process": 1, "worlds": 1})
-    told = wait_for(lambda: read_json(response_of(run)), 10, "the answer")
-    assert told["problem"] == f"the training runs on {socket.gethostname()}, and its rows do not leave that machine"
+    reported = wait_for(lambda: read_json(response_of(run)), 10, "the answer")
+    assert reported["problem"] == f"the training runs on {socket.gethostname()}, and its rows do not leave that machine"
     assert not tap.before_iteration()
     tap.close()

@@ -54,7 +54,7 @@ def train(
     """A rank as the supervisor starts it; exit code and output."""
     raise_epoch(run, epoch)
     spec = {"name": "taught", "train": TRAIN, "track": track, "checkpoint": {"every": 10, "keep": 5}}
-    given = {
+    supplied = {
         **{"MUSTER_STORE": str(run.path.parent.parent), "MUSTER_RUN": run.name, "MUSTER_EPOCH": str(epoch)},
         **{"MUSTER_JOB_EPOCH": "1", "MUSTER_JOB_ID": "job", "MUSTER_SPEC": json.dumps(spec)},
         **{**placement(), "HOME": str(run.path), "NETRC": "/dev/null"},
@@ -62,7 +62,7 @@ def train(
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("WANDB_", "MLFLOW_"))}
     done = subprocess.run(
         [sys.executable, *how],
-        env={**kept, "PYTHONPATH": str(ROOT), **given, **env},
+        env={**kept, "PYTHONPATH": str(ROOT), **supplied, **env},
         cwd=run.path,
         capture_output=True,
         text=True,
@@ -92,14 +92,16 @@ def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_
     }
     expected = killed_and_gone_on(run, track)
     client = mlflow.MlflowClient(uri)
-    [there] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
-    assert there.info.status == "FINISHED" and there.info.run_name == "taught" and there.data.tags["b"] == "c"
-    assert there.data.params["train.config.episode_seconds"] == "0.5" and "versions.torch" in there.data.params
-    told = client.get_metric_history(there.info.run_id, "train/env_steps")
-    assert [(each.step, each.value) for each in told] == [(each["iteration"], each["env_steps"]) for each in expected]
-    files = {each.path for each in client.list_artifacts(there.info.run_id)}
+    [existing] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
+    assert existing.info.status == "FINISHED" and existing.info.run_name == "taught" and existing.data.tags["b"] == "c"
+    assert existing.data.params["train.config.episode_seconds"] == "0.5" and "versions.torch" in existing.data.params
+    reported = client.get_metric_history(existing.info.run_id, "train/env_steps")
+    assert [(each.step, each.value) for each in reported] == [
+        (each["iteration"], each["env_steps"]) for each in expected
+    ]
+    files = {each.path for each in client.list_artifacts(existing.info.run_id)}
     assert files == {"reward.png", "00000040-e2.json"}
-    assert there.data.metrics["evaluation/length"] > 29.0  # of 0.5 s at 60 Hz, within which hardly a pole falls
+    assert existing.data.metrics["evaluation/length"] > 29.0  # of 0.5 s at 60 Hz, within which hardly a pole falls
 
     [file] = run.tracking.glob("wandb/offline-run-*-taught/run-taught.wandb")
     rows = [row for row in history(file) if "train/env_steps" in row]
@@ -154,12 +156,12 @@ def server(tmp_path: Path) -> Iterator[str]:
 def test_over_http_a_training_that_was_killed_and_goes_on_is_one_run_of_mlflow_s_server(run: Run, server: str) -> None:
     expected = killed_and_gone_on(run, {"mlflow": {"uri": server, "experiment": "poles"}})
     client = importlib.import_module("mlflow").MlflowClient(server)
-    [there] = client.search_runs([client.get_experiment_by_name("poles").experiment_id])
-    assert there.info.status == "FINISHED" and there.info.run_name == "taught"
+    [existing] = client.search_runs([client.get_experiment_by_name("poles").experiment_id])
+    assert existing.info.status == "FINISHED" and existing.info.run_name == "taught"
     for name, key in (("train/env_steps", "env_steps"), ("train/kl", "kl")):
-        told = client.get_metric_history(there.info.run_id, name)
-        assert [(each.step, each.value) for each in told] == [(each["iteration"], each[key]) for each in expected]
-    assert {each.path for each in client.list_artifacts(there.info.run_id)} == {"reward.png", "00000040-e2.json"}
+        reported = client.get_metric_history(existing.info.run_id, name)
+        assert [(each.step, each.value) for each in reported] == [(each["iteration"], each[key]) for each in expected]
+    assert {each.path for each in client.list_artifacts(existing.info.run_id)} == {"reward.png", "00000040-e2.json"}
     assert len(list((run.path.parent.parent.parent / "artifacts").rglob("reward.png"))) == 1, "sent through the server"
 
 
@@ -188,8 +190,8 @@ def test_a_kill_while_mlflow_s_run_is_made_costs_it_no_parameter(tmp_path: Path)
         with contextlib.suppress(Killed):
             service.open(None, "taught")
     assert answered == 0, "a run that has its parameters gets none"
-    [there] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
-    assert there.data.params == {f"train.{name}": str(value) for name, value in config["train"].items()}
+    [existing] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
+    assert existing.data.params == {f"train.{name}": str(value) for name, value in config["train"].items()}
 
 
 def test_without_a_key_a_training_ends_before_it_begins_with_one_line_and_no_prompt(run: Run) -> None:
@@ -208,10 +210,10 @@ def test_a_server_that_is_away_costs_the_training_nothing_and_the_rest_is_sent_a
     mlflow = pytest.importorskip("mlflow", reason="pip install 'muster[mlflow]', or make services")
     code, output = train(run, 1, {"mlflow": {"uri": f"http://127.0.0.1:{free_port()}"}})
     assert code == 0, output
-    said = [line for line in output.splitlines() if line.startswith("mlflow: ")]
-    assert [line.partition("(")[0] for line in said[:1]] == ["mlflow: warning: nothing can be sent now "]
+    message = [line for line in output.splitlines() if line.startswith("mlflow: ")]
+    assert [line.partition("(")[0] for line in message[:1]] == ["mlflow: warning: nothing can be sent now "]
     sends = f"mlflow: warning: not everything was sent; `python -m worker.track {run.path} mlflow` sends the rest"
-    assert said[1:] == [sends]
+    assert message[1:] == [sends]
 
     uri = f"sqlite:///{run.path.parent.parent}/mlflow.db"
     for _ in range(2):  # the second time there is nothing left to be sent
@@ -220,9 +222,9 @@ def test_a_server_that_is_away_costs_the_training_nothing_and_the_rest_is_sent_a
         done = subprocess.run(command, env=env, capture_output=True, text=True, cwd=run.path, timeout=60 * PATIENCE)
         assert done.returncode == 0, done.stderr
     client = mlflow.MlflowClient(uri)
-    [there] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
-    steps = [each.step for each in client.get_metric_history(there.info.run_id, "train/kl")]
-    assert steps == list(range(1, 41)) and there.info.status == "FINISHED"
+    [existing] = client.search_runs([client.get_experiment_by_name("Cartpole").experiment_id])
+    steps = [each.step for each in client.get_metric_history(existing.info.run_id, "train/kl")]
+    assert steps == list(range(1, 41)) and existing.info.status == "FINISHED"
 
 
 def test_a_package_that_is_missing_is_named_with_what_installs_it(run: Run, tmp_path: Path) -> None:

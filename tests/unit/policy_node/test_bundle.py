@@ -46,9 +46,9 @@ def test_a_bundle_passes_its_self_test_and_shows_its_joints_unless_the_domain_is
     bundle: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main([str(bundle), "--check"]) == 0
-    said = capsys.readouterr().out
-    assert "Walker of by-hand, checkpoint 00000001-e1: self-test passed, actions differ by" in said
-    assert "knee  position [rad] -1.500 to 1.500, default position 0.3000, stiffness 20, damping 1" in said
+    output = capsys.readouterr().out
+    assert "Walker of by-hand, checkpoint 00000001-e1: self-test passed, actions differ by" in output
+    assert "knee  position [rad] -1.500 to 1.500, default position 0.3000, stiffness 20, damping 1" in output
     monkeypatch.setenv("ROS_DOMAIN_ID", "seven")
     assert main([str(bundle), "--check"]) == 1
     assert capsys.readouterr().err == "error: ROS_DOMAIN_ID=seven: expected an integer\n"
@@ -61,7 +61,7 @@ def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "output"),
     [
         (lambda path: flipped(path / "policy.onnx"), "policy.onnx was altered (SHA-256 differs)"),
         (lambda path: flipped(path / "contract.json"), "contract.json was altered (SHA-256 differs)"),
@@ -83,12 +83,12 @@ def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: 
     ],
 )
 def test_an_altered_bundle_is_refused(
-    bundle: Path, change: Callable[[Path], None], said: str, capsys: pytest.CaptureFixture[str]
+    bundle: Path, change: Callable[[Path], None], output: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     change(bundle)
     assert main([str(bundle)]) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith(f"error: {bundle}: {said}")
+    assert line.startswith(f"error: {bundle}: {output}")
 
 
 def test_every_byte_of_the_manifest_counts(bundle: Path) -> None:
@@ -119,9 +119,9 @@ UNREADABLE = {
 }
 
 
-@pytest.mark.parametrize("said", UNREADABLE)
-def test_a_contract_that_can_t_be_read_is_refused(bundle: Path, said: str) -> None:
-    change = UNREADABLE[said]
+@pytest.mark.parametrize("output", UNREADABLE)
+def test_a_contract_that_can_t_be_read_is_refused(bundle: Path, output: str) -> None:
+    change = UNREADABLE[output]
 
     def edit(path: Path) -> None:
         document = json.loads((path / "contract.json").read_text())
@@ -129,7 +129,7 @@ def test_a_contract_that_can_t_be_read_is_refused(bundle: Path, said: str) -> No
         (path / "contract.json").write_text(json.dumps(document))
 
     resealed(bundle, edit)
-    with pytest.raises(Refused, match=re.escape(said)):
+    with pytest.raises(Refused, match=re.escape(output)):
         open_bundle(bundle)
 
 
@@ -223,9 +223,9 @@ MISUSE = {
 }
 
 
-@pytest.mark.parametrize("said", MISUSE)
-def test_wrong_use_is_one_line(bundle: Path, tmp_path: Path, said: str, capsys: pytest.CaptureFixture[str]) -> None:
-    options = MISUSE[said]
+@pytest.mark.parametrize("output", MISUSE)
+def test_wrong_use_is_one_line(bundle: Path, tmp_path: Path, output: str, capsys: pytest.CaptureFixture[str]) -> None:
+    options = MISUSE[output]
     names = tmp_path / "names.txt"
     names.write_text("wheel = left_wheel  # of the robot\nkne = motor\n")
     twice = tmp_path / "twice.txt"
@@ -233,7 +233,7 @@ def test_wrong_use_is_one_line(bundle: Path, tmp_path: Path, said: str, capsys: 
     files = {"JOINTS": str(names), "TWICE": str(twice)}
     assert main([str(bundle), *(files.get(each, each) for each in options)]) == 1
     (line,) = capsys.readouterr().err.strip().splitlines()
-    assert said in line
+    assert output in line
 
 
 UNFIT = {

@@ -31,17 +31,17 @@ def choosing(*targets: tuple[Target, ...]) -> Contract:
     return Contract("Car", "1", 15.0, (group,), choices, tuple(each.name for each in choices), discrete=True)
 
 
-def asked(angle: float, speed: float) -> tuple[Target, ...]:
+def requested(angle: float, speed: float) -> tuple[Target, ...]:
     return Target("steering", "position", "rad", angle), Target("wheel", "velocity", "rad/s", speed)
 
 
 def test_a_choice_commands_its_targets() -> None:
-    contract = for_node(choosing(asked(0.5, 1.0), asked(0.0, 2.0), asked(-0.5, 1.0)))
+    contract = for_node(choosing(requested(0.5, 1.0), requested(0.0, 2.0), requested(-0.5, 1.0)))
     commands = Commands(contract, {"steering": "servo"})
     assert commands.joints == ["servo", "wheel"] and Observations(contract).joints == ("steering", "wheel")
-    for number, wanted in enumerate(([0.5, 1.0], [0.0, 2.0], [-0.5, 1.0])):
+    for number, expected in enumerate(([0.5, 1.0], [0.0, 2.0], [-0.5, 1.0])):
         command = commands.command(np.array([number], np.float32))
-        assert command.values.tolist() == wanted and command.limited == 0
+        assert command.values.tolist() == expected and command.limited == 0
     position, velocity = commands.joint_states(commands.command(np.array([2.0], np.float32)), Messages(), 0)
     assert (list(position.name), list(position.position)) == (["servo"], [-0.5])
     assert (list(velocity.name), list(velocity.velocity)) == (["wheel"], [1.0])
@@ -50,7 +50,8 @@ def test_a_choice_commands_its_targets() -> None:
 
 
 @pytest.mark.parametrize(
-    "contract", [choosing((), ()), choosing(asked(0.5, 1.0), ()), choosing(asked(0.5, 1.0), asked(0.0, 1.0)[::-1])]
+    "contract",
+    [choosing((), ()), choosing(requested(0.5, 1.0), ()), choosing(requested(0.5, 1.0), requested(0.0, 1.0)[::-1])],
 )
 def test_a_contract_that_does_not_say_what_a_choice_asks_for_is_refused(contract: Contract) -> None:
     with pytest.raises(

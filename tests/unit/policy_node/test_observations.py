@@ -61,18 +61,18 @@ def odometry(linear: tuple[float, ...], angular: tuple[float, ...]) -> Any:
     )
 
 
-class Heard:
+class Received:
     """Observations of a contract, and messages for them."""
 
-    def __init__(self, given: Contract, **names: str) -> None:
-        self.observations = Observations(for_node(given))
+    def __init__(self, supplied: Contract, **names: str) -> None:
+        self.observations = Observations(for_node(supplied))
         self.inputs = Inputs(self.observations, MESSAGES, names)
 
     def hear(self, topic: str, message: Any, kind: str, data: bytes | None = None) -> list[str]:
         """Take in a message; what the node says of it."""
-        (there,) = (each for each in self.inputs.all if each.topic == topic)
+        (existing,) = (each for each in self.inputs.all if each.topic == topic)
         bytes_ = MESSAGES.encode(message, kind) if data is None else data
-        self.inputs.hear(there, f"/{topic}")(bytes_, kind, MESSAGES.type_hash(kind))
+        self.inputs.hear(existing, f"/{topic}")(bytes_, kind, MESSAGES.type_hash(kind))
         self.inputs.update({topic: f"/{topic}"})
         return self.inputs.complaints()
 
@@ -88,10 +88,10 @@ class Heard:
 
 
 def test_each_term_follows_the_contract_from_the_messages() -> None:
-    heard = Heard(contract())
-    heard.all()
-    heard.observations.acted(np.array([1.5], np.float32))
-    assert heard.seen() == pytest.approx(
+    received = Received(contract())
+    received.all()
+    received.observations.acted(np.array([1.5], np.float32))
+    assert received.seen() == pytest.approx(
         [
             # 2 * clip(0.7 - 0.3) and clip(2): joints by name, whatever their order
             *(0.8, 0.5),
@@ -111,30 +111,30 @@ def test_each_term_follows_the_contract_from_the_messages() -> None:
 
 
 def test_history_shifts_and_a_reset_forgets_it_and_the_last_action() -> None:
-    heard = Heard(contract())
-    heard.all()
-    heard.observations.acted(np.array([1.5], np.float32))
-    heard.seen()
-    heard.hear("joint_states", joints(velocity=(0.0, 0.0, 5.0)), JOINT_STATE)
-    assert heard.seen()[2:6] == [4.0, -1.0, 5.0, 0.0], "the oldest first"
-    heard.observations.reset()
-    seen = heard.seen()
+    received = Received(contract())
+    received.all()
+    received.observations.acted(np.array([1.5], np.float32))
+    received.seen()
+    received.hear("joint_states", joints(velocity=(0.0, 0.0, 5.0)), JOINT_STATE)
+    assert received.seen()[2:6] == [4.0, -1.0, 5.0, 0.0], "the oldest first"
+    received.observations.reset()
+    seen = received.seen()
     assert seen[2:6] == [5.0, 0.0, 5.0, 0.0] and seen[-1] == 0.0
 
 
 def test_a_commanded_velocity_that_is_too_old_is_0() -> None:
-    heard = Heard(contract())
-    heard.all()
-    (command,) = (each for each in heard.inputs.all if each.topic == "cmd_vel")
-    snapshot = heard.inputs.snapshot(command.arrived + 0.6)
+    received = Received(contract())
+    received.all()
+    (command,) = (each for each in received.inputs.all if each.topic == "cmd_vel")
+    snapshot = received.inputs.snapshot(command.arrived + 0.6)
     assert snapshot.commands["velocity"].tolist() == [0.0, 0.0, 0.0]
     assert command.is_silent(command.arrived + 0.6) and not command.is_silent(command.arrived + 0.4)
 
 
 def test_a_policy_never_goes_faster_than_commanded() -> None:
-    heard = Heard(contract())
-    heard.all()
-    (command,) = (each for each in heard.inputs.all if each.topic == "cmd_vel")
+    received = Received(contract())
+    received.all()
+    (command,) = (each for each in received.inputs.all if each.topic == "cmd_vel")
     assert command.command is not None
     now, ranges = command.arrived, command.command.ranges[1:]
     for ends, value, slow in (
@@ -151,37 +151,37 @@ def test_a_policy_never_goes_faster_than_commanded() -> None:
 
 def test_other_commands_are_arrays_that_do_not_grow_old() -> None:
     reach = Command("reach", ("x", "y"), ("m", "m"), ((0.0, 1.0), None), (5.0, 5.0), "pose_command", True)
-    told = term("command_number", 0, 2, kind="command", command="reach", element="index", elements=("0", "1"))
-    heard = Heard(contract(told, commands=(reach,)))
-    heard.hear("joint_states", joints(("knee",), position=(0.0,), velocity=(0.0,)), JOINT_STATE)
+    reported = term("command_number", 0, 2, kind="command", command="reach", element="index", elements=("0", "1"))
+    received = Received(contract(reported, commands=(reach,)))
+    received.hear("joint_states", joints(("knee",), position=(0.0,), velocity=(0.0,)), JOINT_STATE)
     line = "/commands/reach: message ignored: 3 numbers, the command reach has x, y"
-    assert heard.hear("commands/reach", MESSAGES.array((1.0, 2.0, 3.0)), ARRAY) == [line]
-    heard.hear("commands/reach", MESSAGES.array((1.5, 2.0)), ARRAY)
-    assert heard.seen() == [1.0, 2.0]
-    assert heard.inputs.snapshot(1e9).commands["reach"].tolist() == [1.0, 2.0]
+    assert received.hear("commands/reach", MESSAGES.array((1.0, 2.0, 3.0)), ARRAY) == [line]
+    received.hear("commands/reach", MESSAGES.array((1.5, 2.0)), ARRAY)
+    assert received.seen() == [1.0, 2.0]
+    assert received.inputs.snapshot(1e9).commands["reach"].tolist() == [1.0, 2.0]
 
 
 def test_images_are_stacked_with_the_present_one_first() -> None:
     group = Group("policy", "image", (6, 2, 2), "uint8", image=Image(("red", "green", "blue"), 2, {}))
-    heard = Heard(contract(groups=(group,)))
-    heard.hear("joint_states", joints(("knee",), position=(0.0,), velocity=(0.0,)), JOINT_STATE)
+    received = Received(contract(groups=(group,)))
+    received.hear("joint_states", joints(("knee",), position=(0.0,), velocity=(0.0,)), JOINT_STATE)
 
     def picture(first: int, **changes: Any) -> Any:
         data = np.arange(first, first + 14, dtype=np.uint8)  # rows of 6 bytes and one of padding
         fields = {"height": 2, "width": 2, "encoding": "bgr8", "is_bigendian": 0, "step": 7, "data": data, **changes}
         return MESSAGES.make(IMAGE, header=MESSAGES.header(0), **fields)
 
-    assert heard.hear("image_raw", picture(0, encoding="mono8"), IMAGE) == [
+    assert received.hear("image_raw", picture(0, encoding="mono8"), IMAGE) == [
         "/image_raw: message ignored: an image of encoding mono8; the policy takes rgb8 or bgr8"
     ]
-    assert heard.hear("image_raw", picture(0, width=3), IMAGE) == [
+    assert received.hear("image_raw", picture(0, width=3), IMAGE) == [
         "/image_raw: message ignored: an image of 3 x 2, the policy takes 2 x 2"
     ]
-    heard.hear("image_raw", picture(0), IMAGE)
+    received.hear("image_raw", picture(0), IMAGE)
     red, green, blue = [[2, 5], [9, 12]], [[1, 4], [8, 11]], [[0, 3], [7, 10]]
-    assert heard.observations.build(heard.inputs.snapshot(0.0))["image"].tolist() == [[red, green, blue] * 2]
-    heard.hear("image_raw", picture(100), IMAGE)
-    seen = heard.observations.build(heard.inputs.snapshot(0.0))["image"][0]
+    assert received.observations.build(received.inputs.snapshot(0.0))["image"].tolist() == [[red, green, blue] * 2]
+    received.hear("image_raw", picture(100), IMAGE)
+    seen = received.observations.build(received.inputs.snapshot(0.0))["image"][0]
     assert seen[0].tolist() == [[102, 105], [109, 112]] and seen[3].tolist() == red and seen.dtype == np.uint8
 
 
@@ -201,29 +201,29 @@ UNUSABLE = {
 }
 
 
-@pytest.mark.parametrize("said", UNUSABLE)
-def test_a_message_that_can_t_be_used_is_ignored_with_one_line(said: str) -> None:
-    message, heard = UNUSABLE[said], Heard(contract())
+@pytest.mark.parametrize("output", UNUSABLE)
+def test_a_message_that_can_t_be_used_is_ignored_with_one_line(output: str) -> None:
+    message, received = UNUSABLE[output], Received(contract())
     topic, kind = ("imu", IMU) if hasattr(message, "orientation") else ("joint_states", JOINT_STATE)
-    (line,) = heard.hear(topic, message, kind)
-    assert line.startswith(f"/{topic}: message ignored: {said}")
-    assert heard.hear(topic, message, kind) == [], "once"
-    assert heard.inputs.ignored[f"/{topic}"] == 2 and len(heard.inputs.missing()) == 4
+    (line,) = received.hear(topic, message, kind)
+    assert line.startswith(f"/{topic}: message ignored: {output}")
+    assert received.hear(topic, message, kind) == [], "once"
+    assert received.inputs.ignored[f"/{topic}"] == 2 and len(received.inputs.missing()) == 4
 
 
 def test_a_good_message_after_a_bad_one_counts_and_a_bad_one_does_not_make_the_last_good_one_younger() -> None:
-    heard = Heard(contract())
-    heard.hear("joint_states", joints(), JOINT_STATE)
-    there = heard.inputs.all[0]
-    arrived, value = there.arrived, there.value
-    heard.hear("joint_states", joints(position=(0.0, 0.0, np.nan)), JOINT_STATE)
-    assert there.arrived == arrived and there.value is value
-    heard.hear("joint_states", joints(), JOINT_STATE)
-    assert there.arrived > arrived
+    received = Received(contract())
+    received.hear("joint_states", joints(), JOINT_STATE)
+    existing = received.inputs.all[0]
+    arrived, value = existing.arrived, existing.value
+    received.hear("joint_states", joints(position=(0.0, 0.0, np.nan)), JOINT_STATE)
+    assert existing.arrived == arrived and existing.value is value
+    received.hear("joint_states", joints(), JOINT_STATE)
+    assert existing.arrived > arrived
 
 
 @pytest.mark.parametrize(
-    ("kind", "data", "said"),
+    ("kind", "data", "output"),
     [
         (TWIST, None, "/imu: message ignored: it is a geometry_msgs/msg/Twist, and the node reads sensor_msgs/msg/Imu"),
         (IMU, b"\0\1\0\0abc", "/imu: message ignored: 7 bytes that are no sensor_msgs/msg/Imu"),
@@ -231,22 +231,22 @@ def test_a_good_message_after_a_bad_one_counts_and_a_bad_one_does_not_make_the_l
     ],
 )
 def test_a_message_of_a_wrong_type_or_of_wrong_bytes_is_ignored_with_one_line(
-    kind: str, data: bytes | None, said: str
+    kind: str, data: bytes | None, output: str
 ) -> None:
-    heard = Heard(contract())
-    (line,) = heard.hear("imu", MESSAGES.twist((0.0,) * 3, (0.0,) * 3), kind, data)
-    assert line.startswith(said) and "\n" not in line
-    (there,) = (each for each in heard.inputs.all if each.topic == "imu")
-    heard.inputs.hear(there, "/imu")(b"", IMU, "RIHS01_0123")
-    other = heard.inputs.complaints()[-1]
+    received = Received(contract())
+    (line,) = received.hear("imu", MESSAGES.twist((0.0,) * 3, (0.0,) * 3), kind, data)
+    assert line.startswith(output) and "\n" not in line
+    (existing,) = (each for each in received.inputs.all if each.topic == "imu")
+    received.inputs.hear(existing, "/imu")(b"", IMU, "RIHS01_0123")
+    other = received.inputs.complaints()[-1]
     assert "/imu: message ignored: sensor_msgs/msg/Imu of another definition (RIHS01_0123" in other
     assert other.endswith("give --distro as the robot has it")
 
 
 def test_an_imu_without_orientation_suffices_for_a_policy_that_reads_none() -> None:
-    heard = Heard(contract(term("imu_angular_velocity", 0, 3, frame=UNIT)))
+    received = Received(contract(term("imu_angular_velocity", 0, 3, frame=UNIT)))
     without = imu((0.0, 0.0, 0.0, 0.0), orientation_covariance=MISSING)
-    assert heard.hear("imu", without, IMU) == []
+    assert received.hear("imu", without, IMU) == []
 
 
 LEG = Frame("foot", "foot", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), False)
@@ -287,11 +287,11 @@ UNAVAILABLE = {
 }
 
 
-@pytest.mark.parametrize("said", UNAVAILABLE)
-def test_a_policy_that_needs_an_unavailable_quantity_is_refused_in_one_line(said: str) -> None:
-    terms = UNAVAILABLE[said]
+@pytest.mark.parametrize("output", UNAVAILABLE)
+def test_a_policy_that_needs_an_unavailable_quantity_is_refused_in_one_line(output: str) -> None:
+    terms = UNAVAILABLE[output]
     line = refusal(Observations, for_node(contract(*terms)), error=Refused)
-    assert line.startswith(f"task Walker can't run on a robot: {said}") and "\n" not in line
+    assert line.startswith(f"task Walker can't run on a robot: {output}") and "\n" not in line
 
 
 def test_groups_that_the_node_can_t_read_are_refused() -> None:
@@ -306,11 +306,11 @@ def test_groups_that_the_node_can_t_read_are_refused() -> None:
 
 
 def test_a_joint_of_another_name_on_the_robot_is_found_by_it() -> None:
-    heard = Heard(contract(), knee="KneeMotor")
-    assert heard.hear("joint_states", joints(("wheel", "other", "KneeMotor")), JOINT_STATE) == []
-    positions, _ = heard.inputs.all[0].value
-    assert dict(zip(heard.observations.joints, positions, strict=True)) == {"knee": 0.7, "wheel": 2.0}
-    (line,) = heard.hear("joint_states", joints(("wheel", "other", "knee")), JOINT_STATE)
+    received = Received(contract(), knee="KneeMotor")
+    assert received.hear("joint_states", joints(("wheel", "other", "KneeMotor")), JOINT_STATE) == []
+    positions, _ = received.inputs.all[0].value
+    assert dict(zip(received.observations.joints, positions, strict=True)) == {"knee": 0.7, "wheel": 2.0}
+    (line,) = received.hear("joint_states", joints(("wheel", "other", "knee")), JOINT_STATE)
     assert "no joint is called KneeMotor (knee of the policy)" in line
 
 

@@ -87,10 +87,10 @@ def test_the_policy_observes_its_last_action_unclipped(rig: Rig) -> None:
 def test_a_silent_input_stops_the_node_with_one_last_command_that_holds_the_joints(rig: Rig) -> None:
     rig.step(0.0, knee=0.4, position=0.1)
     assert rig.step(0.05), "not too old yet"
-    given = len(rig.commanded)
-    assert not rig.step(0.07, knee=float("nan")) and rig.commanded[given:] == [pytest.approx(0.1)]
+    supplied = len(rig.commanded)
+    assert not rig.step(0.07, knee=float("nan")) and rig.commanded[supplied:] == [pytest.approx(0.1)]
     assert "joint_states: message ignored: not finite: its velocities" in rig.lines, "which is silence"
-    assert not rig.step(0.09) and len(rig.commanded) == given + 1, "and no further one"
+    assert not rig.step(0.09) and len(rig.commanded) == supplied + 1, "and no further one"
     assert rig.lines[-1].startswith(
         "joint_states is silent for 70 ms: one last command holds the joints where they are"
     )
@@ -177,26 +177,26 @@ NO_JOINTS = {
 }
 
 
-@pytest.mark.parametrize("said", NO_JOINTS)
-def test_a_policy_that_drives_no_joints_is_refused_in_one_line(said: str) -> None:
-    changes = NO_JOINTS[said]
-    assert said in refusal(Commands, for_node(contract(SPEED, LAST, **changes)), error=Refused)
+@pytest.mark.parametrize("output", NO_JOINTS)
+def test_a_policy_that_drives_no_joints_is_refused_in_one_line(output: str) -> None:
+    changes = NO_JOINTS[output]
+    assert output in refusal(Commands, for_node(contract(SPEED, LAST, **changes)), error=Refused)
 
 
 def test_a_stopped_terminal_does_not_block_and_later_lines_are_dropped() -> None:
-    goes_on, said = threading.Event(), list[str]()
+    goes_on, output = threading.Event(), list[str]()
 
-    def tell(line: str) -> None:
+    def report(line: str) -> None:
         goes_on.wait()
-        said.append(line)
+        output.append(line)
 
-    lines = Lines(tell)
+    lines = Lines(report)
     for number in range(2 * module.MOST):
         lines.say(str(number))
-    assert said == []
+    assert output == []
     goes_on.set()
-    while len(said) < module.MOST:
+    while len(output) < module.MOST:
         pass
     lines.say("the end")
     lines.close()
-    assert said[:3] == ["0", "1", "2"] and said[-1] == "the end" and len(said) <= module.MOST + 2
+    assert output[:3] == ["0", "1", "2"] and output[-1] == "the end" and len(output) <= module.MOST + 2

@@ -14,7 +14,7 @@ TRUNK = Frame("trunk", "trunk", (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), True)
 
 def term(name: str, first: int, size: int, **options: object) -> Term:
     """A term of Muster's library whose function has its name."""
-    given: dict[str, object] = {
+    supplied: dict[str, object] = {
         "kind": "measured",
         "names": tuple(f"{name}_{index}" for index in range(size)),
         "units": ("1",) * size,
@@ -24,7 +24,7 @@ def term(name: str, first: int, size: int, **options: object) -> Term:
         "library": True,
         **options,
     }
-    return Term(name=name, first=first, **given)
+    return Term(name=name, first=first, **supplied)
 
 
 KNEE = Action(
@@ -63,13 +63,13 @@ VELOCITY = Command(
 
 def contract(*terms: Term, recurrent: bool = False, **changes: object) -> Contract:
     """Of these terms, by default all of them."""
-    given = terms or TERMS
-    size = sum(each.size for each in given)
+    supplied = terms or TERMS
+    size = sum(each.size for each in supplied)
     fields: dict[str, object] = {
         "task": "Walker",
         "muster": "0.1.0",
         "control_hz": 50.0,
-        "groups": (Group("policy", "obs", (size,), "float32", given),),
+        "groups": (Group("policy", "obs", (size,), "float32", supplied),),
         "actions": (KNEE,),
         "action_names": ("knee",),
         "commands": (VELOCITY,),

@@ -83,12 +83,12 @@ def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
     with pytest.raises(UserError, match=shape):
         check_actions(torch.zeros(4), torch.Size((4, 2)), "own:A")
     check_actions(torch.zeros(4, 2), torch.Size((4, 2)), "own:A")
-    for metrics, said in (
+    for metrics, output in (
         (None, "a mapping of metrics, not a NoneType"),
         ({"loss": 0.5}, r"tensors of shape \(\); its metric loss is float"),
         ({"loss": torch.zeros(3)}, r"tensors of shape \(\); its metric loss is \(3,\)"),
     ):
-        with pytest.raises(UserError, match=rf"own:A: learn\(\) must give {said}$"):
+        with pytest.raises(UserError, match=rf"own:A: learn\(\) must give {output}$"):
             check_metrics(metrics, "own:A")
     with pytest.raises(UserError, match=r"own:A: a metric of learn\(\) can't be called reward: every record has one$"):
         check_names(["loss", "reward"], ["reward", "score"], "own:A")
@@ -132,7 +132,7 @@ def read(train: dict[str, Any], **spec: Any) -> Job:
 
 
 @pytest.mark.parametrize(
-    ("train", "said"),
+    ("train", "output"),
     [
         ({"ppo": 5}, "train.ppo: expected an object, found an integer (5)"),
         ({"algorithm": "sac", "sac": [1]}, "train.sac: expected an object, found a list"),
@@ -142,8 +142,8 @@ def read(train: dict[str, Any], **spec: Any) -> Job:
         ({"algorithm": None}, "train.algorithm: expected a string, found nothing"),
     ],
 )
-def test_an_invalid_section_is_refused_in_one_line(train: dict[str, Any], said: str) -> None:
-    assert refusal(read, train, error=UserError) == said
+def test_an_invalid_section_is_refused_in_one_line(train: dict[str, Any], output: str) -> None:
+    assert refusal(read, train, error=UserError) == output
 
 
 def test_an_invalid_section_of_the_spec_is_refused_too() -> None:
@@ -165,9 +165,9 @@ def test_a_class_of_an_earlier_version_is_refused_with_its_replacement() -> None
 
 
 def test_an_uninstalled_source_tree_has_its_own_algorithms(monkeypatch: pytest.MonkeyPatch) -> None:
-    there = algorithms.installed()
+    existing = algorithms.installed()
     monkeypatch.setattr(algorithms, "entry_points", lambda group: ())
-    assert algorithms.installed() == there and there["ppo"] == "worker.learning.ppo.fused:PPO"
+    assert algorithms.installed() == existing and existing["ppo"] == "worker.learning.ppo.fused:PPO"
 
 
 def test_settings_import_neither_torch_nor_warp() -> None:

@@ -49,12 +49,12 @@ def say(store: Path, first: str, second: str, capsys: pytest.CaptureFixture[str]
 
 
 def test_twins_are_equal_and_another_seed_is_not(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, said = say(trained, "one", "twin", capsys)
-    assert code == 0 and re.search(r"^equal: \d+ tensors, 3 iterations\n$", said, re.MULTILINE)
-    code, said = say(trained, "one", "other", capsys)
+    code, output = say(trained, "one", "twin", capsys)
+    assert code == 0 and re.search(r"^equal: \d+ tensors, 3 iterations\n$", output, re.MULTILINE)
+    code, output = say(trained, "one", "other", capsys)
     number = r"-?\d+\.\d+(e-\d+)?"
     line = rf"different: learner.pt: algorithm\.\S+: at \[[\d, ]*\]: {number} and {number} \(\d+ of \d+ elements differ\)\n"
-    assert code == 1 and re.search(line, said), said
+    assert code == 1 and re.search(line, output), output
 
 
 @pytest.mark.parametrize("name", ["learner.pt", "rank-0.pt"])
@@ -67,9 +67,9 @@ def test_one_bit_of_one_element_is_found(store: Path, name: str, capsys: pytest.
     torch.save(content, path)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("shared_store.volume.checkpoints.Checkpoint.verify", lambda _: None)
-        code, said = say(store, "one", "twin", capsys)
+        code, output = say(store, "one", "twin", capsys)
     last = [size - 1 for size in victim.shape]
-    assert code == 1 and f"{key.rpartition('.')[2]}: at {last}: " in said and "(1 of " in said, said
+    assert code == 1 and f"{key.rpartition('.')[2]}: at {last}: " in output and "(1 of " in output, output
 
 
 @pytest.mark.parametrize(
@@ -102,11 +102,11 @@ def test_metrics_are_compared_but_not_times(store: Path, capsys: pytest.CaptureF
     assert say(store, "one", "twin", capsys)[0] == 0
     lines[2]["kl"] += 1e-12
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
-    code, said = say(store, "one", "twin", capsys)
-    assert code == 1 and f"different: metrics of iteration {lines[2]['iteration']}: kl: " in said
+    code, output = say(store, "one", "twin", capsys)
+    assert code == 1 and f"different: metrics of iteration {lines[2]['iteration']}: kl: " in output
     path.write_text("".join(json.dumps(line) + "\n" for line in lines if line.get("iteration") != 2))
-    code, said = say(store, "one", "twin", capsys)
-    assert code == 1 and "run twin has 2 of 3 iterations (look at 2)" in said
+    code, output = say(store, "one", "twin", capsys)
+    assert code == 1 and "run twin has 2 of 3 iterations (look at 2)" in output
     assert len(read_metrics(run(store, "twin"))) == 2
 
 
@@ -122,8 +122,8 @@ def test_worlds_are_compared_by_global_index_whatever_shards_they_lie_in(
     manifest = {**checkpoint.manifest, "shards": [[0, 3], [3, 5]], "world_size": 2}
     (checkpoint.path / "manifest.json").write_text(json.dumps(manifest))
     monkeypatch.setattr("shared_store.volume.checkpoints.Checkpoint.verify", lambda _: None)
-    code, said = say(store, "one", "twin", capsys)
-    assert code == 0 and "generators are not compared: 1 rank saved them in one run, 2 in the other" in said, said
+    code, output = say(store, "one", "twin", capsys)
+    assert code == 0 and "generators are not compared: 1 rank saved them in one run, 2 in the other" in output, output
     some = Shards(list_checkpoints(run(store, "twin"))[-1]).worlds(2, 4)
     assert all(torch.equal(tensor, content["worlds"]["state"][name][2:6]) for name, tensor in some.items())
 

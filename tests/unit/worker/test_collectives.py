@@ -11,9 +11,9 @@ GANGS = Path(__file__).parents[2] / "training" / "worker" / "test_gangs.py"
 
 
 def test_every_path_that_enters_a_collective_is_listed_and_every_listed_one_is_there() -> None:
-    there = {call.function for call in paths()}
-    assert there - TESTS.keys() - ALONE.keys() == set(), "write a case in test_gangs.py"
-    assert (TESTS.keys() | ALONE.keys()) - there == set(), "these enter no collective any more"
+    existing = {call.function for call in paths()}
+    assert existing - TESTS.keys() - ALONE.keys() == set(), "write a case in test_gangs.py"
+    assert (TESTS.keys() | ALONE.keys()) - existing == set(), "these enter no collective any more"
     assert not TESTS.keys() & ALONE.keys()
 
 

@@ -10,7 +10,7 @@ import pytest
 import warp as wp
 
 from tests.support.refusals import refusal
-from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, far_away, kick, target
+from tests.support.worker.declared import MODEL, Sliders, SlidersConfig, distant, kick, target
 from worker.simulation.declared_randomization import Randomize
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.terrain import Terrain
@@ -126,20 +126,18 @@ MISFITS: dict[str, Any] = {
     ),
     "rewards.place.limit: expected a number, found (1.0, 2.0)": Reward(terms.joint_velocity_excess, limit=(1.0, 2.0)),
     "rewards.plce: it has no weight; give it one, such as Reward(…, weight=-1.0)": Reward(terms.alive),
-    "terminations.typo: far_away has no parameter limt; did you mean limit?": Termination(far_away, limt=3.0),
-    "terminations.out: far_away needs limit=float": Termination(far_away),
-    "terminations.both: far_away has no parameter limt; did you mean limit?": Termination(
-        far_away, limit=3.0, limt=3.0
-    ),
+    "terminations.typo: far_away has no parameter limt; did you mean limit?": Termination(distant, limt=3.0),
+    "terminations.out: far_away needs limit=float": Termination(distant),
+    "terminations.both: far_away has no parameter limt; did you mean limit?": Termination(distant, limit=3.0, limt=3.0),
     "terminations.alive: alive has a parameter terminated, which there is nothing for here": Termination(terms.alive),
-    "terminations.time_out: the clock's own has this name": Termination(far_away, limit=1.0),
+    "terminations.time_out: the clock's own has this name": Termination(distant, limit=1.0),
     "actions: joint first is driven by two terms": Action(terms.effort),
     "actions.force.scale: no column matches 'frst'; did you mean first?": Action(terms.effort, scale={"frst": 1.0}),
     "actions.force.scale: no pattern fits second; add one, such as '*'": Action(terms.effort, scale={"first": 1.0}),
     "commands.target: far_away has a parameter joint, which there is nothing for here": Command(
-        far_away, names=("a",), limit=1.0
+        distant, names=("a",), limit=1.0
     ),
-    "events.kick: an interval needs seconds=(least, greatest), above 0": Event(far_away, limit=1.0, when="interval"),
+    "events.kick: an interval needs seconds=(least, greatest), above 0": Event(distant, limit=1.0, when="interval"),
 }
 
 
@@ -185,8 +183,8 @@ def test_a_terrain_that_no_machine_can_hold() -> None:
         def terrain(self, config: SlidersConfig) -> Terrain:
             return Terrain(resolution=self.resolution)
 
-    there = r"^task Fine: the terrain's 10 x 7 patches at 0.0005 m have .* use a resolution"
-    with pytest.raises(ValueError, match=there):
+    existing = r"^task Fine: the terrain's 10 x 7 patches at 0.0005 m have .* use a resolution"
+    with pytest.raises(ValueError, match=existing):
         Fine.sketch(SlidersConfig())
     Fine.resolution = 0.1
     assert isinstance(Fine.sketch(SlidersConfig()).ground_terrain, Terrain)

@@ -90,20 +90,20 @@ def files_of(policy: Any) -> tuple[dict[str, bytes], dict[str, Any]]:
 
 def test_a_memory_that_the_export_does_not_have_is_refused() -> None:
     """In the first step the two are alike."""
-    there = (
+    existing = (
         r"^the policy of algorithm mine:Mine remembers what it saw before, but its module\(\) has no recurrent state"
     )
-    with pytest.raises(UserError, match=there):
+    with pytest.raises(UserError, match=existing):
         files_of(Summing(tells=False))
 
 
 def test_a_memory_that_the_export_has_is_compared_over_steps_and_resets() -> None:
     files, report = files_of(Summing(tells=True))
-    told = np.load(io.BytesIO(files["parity.npz"]))
+    reported = np.load(io.BytesIO(files["parity.npz"]))
     # by hand: the second world's sum begins anew in step 4
-    wanted = told["obs"].cumsum(0)
-    wanted[4:, 1] = told["obs"][4:, 1].cumsum(0)
-    np.testing.assert_allclose(told["actions"], wanted, atol=1e-5)
+    requested = reported["obs"].cumsum(0)
+    requested[4:, 1] = reported["obs"][4:, 1].cumsum(0)
+    np.testing.assert_allclose(reported["actions"], requested, atol=1e-5)
     assert report["resets"] == 1 and report["observations"] == {"rollout": 18, "made_up": 48}
     with pytest.raises(TrainingError, match=r"^the exported policy \(onnx\) differs from the trained one by 0\.1"):
         files_of(Summing(tells=True, offset=0.1))
@@ -137,18 +137,18 @@ def test_a_recurrent_policy_can_be_run_from_the_bundle_alone(tmp_path: Path, rec
     assert judged["trained"]["success"] is None and "success" not in judged, "this task does not say what that is"
     contract = json.loads((target / "contract.json").read_text())
     assert contract["states"] == [{"name": "h", "output": "h_out", "shape": [1, 8]}]
-    told = np.load(target / "parity.npz")
-    steps, worlds = told["begins"].shape
-    assert steps * worlds >= 1000 and told["begins"][0].all() and told["begins"][1:].sum() > worlds
+    reported = np.load(target / "parity.npz")
+    steps, worlds = reported["begins"].shape
+    assert steps * worlds >= 1000 and reported["begins"][0].all() and reported["begins"][1:].sum() > worlds
     session = onnxruntime.InferenceSession(target / "policy.onnx", providers=["CPUExecutionProvider"])
     state = np.zeros((worlds, 1, 8), dtype=np.float32)
     for step in range(steps):
-        state[told["begins"][step]] = 0.0
-        actions, state = session.run(["actions", "h_out"], {"obs": told["obs"][step], "h": state})
-        np.testing.assert_allclose(actions, told["actions"][step], atol=1e-5)
-    one, zeros = told["extreme_obs"], np.zeros((len(told["extreme_obs"]), 1, 8), dtype=np.float32)
+        state[reported["begins"][step]] = 0.0
+        actions, state = session.run(["actions", "h_out"], {"obs": reported["obs"][step], "h": state})
+        np.testing.assert_allclose(actions, reported["actions"][step], atol=1e-5)
+    one, zeros = reported["extreme_obs"], np.zeros((len(reported["extreme_obs"]), 1, 8), dtype=np.float32)
     (found,) = session.run(["actions"], {"obs": one, "h": zeros})
-    np.testing.assert_allclose(found, told["extreme_actions"], atol=1e-5)
+    np.testing.assert_allclose(found, reported["extreme_actions"], atol=1e-5)
     assert one.shape[1] == 2 and 2 <= len(one) <= 4
     script = torch.jit.load(target / "policy.pt")
     np.testing.assert_allclose(script(torch.from_numpy(one), torch.from_numpy(zeros))[0].numpy(), found, atol=1e-5)
@@ -162,14 +162,14 @@ def test_a_bundle_that_does_worse_than_its_policy_is_not_published(
     before = exported(run, recurrent, GroupedPoint())
     stands = {path.name: path.read_bytes() for path in before.iterdir() if path.is_file()}
 
-    class Away(OnnxPolicy):
+    class Absent(OnnxPolicy):
         def act(self, observations: TensorDict) -> torch.Tensor:
             super().act(observations)
             return torch.sign(observations["policy"][:, :1])
 
-    monkeypatch.setattr(bundle, "OnnxPolicy", Away)
-    there = "^the bundle does not do what the trained policy does: its mean return over 128"
-    with pytest.raises(TrainingError, match=there):
+    monkeypatch.setattr(bundle, "OnnxPolicy", Absent)
+    existing = "^the bundle does not do what the trained policy does: its mean return over 128"
+    with pytest.raises(TrainingError, match=existing):
         exported(run, recurrent, GroupedPoint(world_count=128))
     assert {path.name: path.read_bytes() for path in before.iterdir() if path.is_file()} == stands
     assert [path.name for path in run.exports.iterdir()] == ["00000004-e1"]
@@ -211,9 +211,9 @@ def test_the_metadata_has_what_ros_2_runners_read_with_all_digits() -> None:
     command = Command("velocity", ("x",), ("m/s",), (None,), (5.0, 5.0))
     group = Group("policy", "obs", (2,), "float32", (term,))
     contract = Contract("Walk", "0.1.0", 50.0, (group,), (knee, hip), ("knee", "hip"), (command,))
-    told = metadata_of(contract, "walk/00000004-e1")
-    assert told.pop("muster") == json.dumps(contract.document())
-    assert told == {
+    reported = metadata_of(contract, "walk/00000004-e1")
+    assert reported.pop("muster") == json.dumps(contract.document())
+    assert reported == {
         "run_path": "walk/00000004-e1",
         "joint_names": "knee,hip",
         "joint_stiffness": "20.123456,30.0",
@@ -226,7 +226,7 @@ def test_the_metadata_has_what_ros_2_runners_read_with_all_digits() -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "said"),
+    ("settings", "output"),
     [
         ({"steps": 8, "momentum": 0.9}, r"settings\.momentum: .*, found 0\.9"),
         ({"steps": 0}, r"settings\.steps: .*, found 0"),
@@ -234,12 +234,12 @@ def test_the_metadata_has_what_ros_2_runners_read_with_all_digits() -> None:
     ],
 )
 def test_settings_that_the_algorithm_does_not_take_any_more_are_told_in_one_line(
-    settings: dict[str, Any], said: str
+    settings: dict[str, Any], output: str
 ) -> None:
     """As after an upgrade: a checkpoint has the settings of the program that wrote it."""
     checkpoint: Any = SimpleNamespace(name="00000004-e1", manifest={**FACTS, "algorithm": "ppo", "settings": settings})
-    there = rf"^checkpoint 00000004-e1: algorithm ppo refuses what it was trained with: {said}"
-    with pytest.raises(UserError, match=there) as caught:
+    existing = rf"^checkpoint 00000004-e1: algorithm ppo refuses what it was trained with: {output}"
+    with pytest.raises(UserError, match=existing) as caught:
         load_policy(checkpoint)
     assert "\n" not in str(caught.value)
 
@@ -300,14 +300,14 @@ def test_leapp_itself_runs_the_bundle_as_it_is_described_over_steps_and_a_reset(
     manager = InferenceManager(str(tmp_path / "leapp.yaml"))
     assert manager.inputs == ["policy/obs"] and manager.outputs == ["policy/actions"]
     assert manager.feedback_inputs == ["policy/total"]
-    told = np.load(io.BytesIO(files["parity.npz"]))
+    reported = np.load(io.BytesIO(files["parity.npz"]))
     for world in range(3):
         manager.reset()
-        for step in range(len(told["begins"])):
-            if told["begins"][step, world]:
+        for step in range(len(reported["begins"])):
+            if reported["begins"][step, world]:
                 manager.reset()
-            found = manager({"policy/obs": torch.from_numpy(told["obs"][step, world : world + 1])})
-            np.testing.assert_allclose(found["policy/actions"], told["actions"][step, world : world + 1], atol=1e-5)
+            found = manager({"policy/obs": torch.from_numpy(reported["obs"][step, world : world + 1])})
+            np.testing.assert_allclose(found["policy/actions"], reported["actions"][step, world : world + 1], atol=1e-5)
 
 
 def bundle_of(tmp_path: Path, kind: Any) -> tuple[Path, dict[str, Any]]:
@@ -329,9 +329,9 @@ def test_a_robot_of_musters_own_is_in_the_bundle_with_its_licence(tmp_path: Path
     assert (target / "robot" / file).read_bytes() == Path(worker.tasks.library.__file__).with_name(file).read_bytes()
     assert manifest["robot"] == {"source": file, "format": "mjcf", "licence": "Apache-2.0", "file": f"robot/{file}"}
     assert f"robot/{file}" in manifest["files"]  # with its digest
-    said = (target / "README.md").read_text()
-    assert f"`robot/{file}` is the robot's model ({file}); its licence: Apache-2.0." in said
-    assert "The policy, the contract and the recordings belong to whoever trained the policy" in said
+    output = (target / "README.md").read_text()
+    assert f"`robot/{file}` is the robot's model ({file}); its licence: Apache-2.0." in output
+    assert "The policy, the contract and the recordings belong to whoever trained the policy" in output
 
 
 @pytest.mark.parametrize(("kind", "package"), [(Ant, "newton"), (Go1Flat, "mjlab")])
@@ -341,6 +341,6 @@ def test_a_robot_of_another_package_is_named_with_its_licence_and_not_copied(
     target, manifest = bundle_of(tmp_path, kind)
     assert not (target / "robot").exists() and manifest["robot"]["file"] is None
     assert manifest["robot"]["package"].startswith(f"{package} ") and "Apache" in manifest["robot"]["licence"]
-    said = (target / "README.md").read_text()
-    assert "The robot's model is not in the bundle." in said and manifest["robot"]["licence"] in said
+    output = (target / "README.md").read_text()
+    assert "The robot's model is not in the bundle." in output and manifest["robot"]["licence"] in output
     assert json.loads((target / "manifest.json").read_text())["robot"] == manifest["robot"]

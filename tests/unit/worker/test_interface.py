@@ -50,16 +50,16 @@ def test_an_action_drives_its_joint_as_declared(task: Task) -> None:
     q, qd, first_q, first_qd = (part.clone() if isinstance(part, torch.Tensor) else part for part in joints(task))
     labels = "_".join(label.rsplit("/", 1)[-1] for label in task.worlds.model.joint_label)
     assert labels.removeprefix("root_").startswith("_".join(task.action_names))
-    asked = torch.tensor([-2.0, -0.5, 0.5, 2.0])[:, None] * torch.linspace(0.7, 1.0, len(actions))
-    task.step(asked)
+    requested = torch.tensor([-2.0, -0.5, 0.5, 2.0])[:, None] * torch.linspace(0.7, 1.0, len(actions))
+    task.step(requested)
     drives = wp.to_torch(task.worlds.arrays.drives)
     for index, action in enumerate(actions):
-        given = action.offset + action.scale * asked[:, index].clamp(*action.clip)
-        effort = given
+        supplied = action.offset + action.scale * requested[:, index].clamp(*action.clip)
+        effort = supplied
         if action.kind == "position":
-            assert torch.allclose(wp.to_torch(task.worlds.arrays.controls)[:, index], given)
+            assert torch.allclose(wp.to_torch(task.worlds.arrays.controls)[:, index], supplied)
             position, velocity = q[:, first_q + index], qd[:, first_qd + index]
-            effort = action.stiffness * (given - position) - action.damping * velocity
+            effort = action.stiffness * (supplied - position) - action.damping * velocity
         if action.effort_limit is not None:
             effort = effort.clamp(-action.effort_limit, action.effort_limit)
         assert torch.allclose(drives[:, first_qd + index], effort, rtol=1e-4), action.name
@@ -116,8 +116,8 @@ def test_noise_is_in_the_unit_of_the_quantity_and_leaves_command_and_last_action
     kinds = [seen.kind for seen in blurred.interface().observations]
     assert kinds.count("command") == 3 and kinds.count("previous_action") == 12
     for seen, deviation in zip(blurred.interface().observations, found, strict=True):
-        wanted = [value for pattern, value in deviations.items() if fnmatch.fnmatch(seen.name, pattern)]
-        expected = wanted[0] if wanted and seen.kind == "measured" else 0.0
+        requested = [value for pattern, value in deviations.items() if fnmatch.fnmatch(seen.name, pattern)]
+        expected = requested[0] if requested and seen.kind == "measured" else 0.0
         assert deviation == (pytest.approx(expected, rel=0.15) if expected else 0.0), seen.name
 
 
@@ -136,5 +136,5 @@ def test_noise_that_can_not_be_is_refused_in_one_line(noise: Any, message: str) 
     kind = find_task("Quadruped")
     with pytest.raises(UserError) as error, user_errors():
         kind(configure(kind, {"config": {"randomize": {"observation_noise": noise}}}), 1)
-    said = str(error.value).removeprefix("train.")
-    assert said.startswith(f"config.randomize.observation_noise{message}") and "\n" not in said, said
+    output = str(error.value).removeprefix("train.")
+    assert output.startswith(f"config.randomize.observation_noise{message}") and "\n" not in output, output

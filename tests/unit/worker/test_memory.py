@@ -60,8 +60,8 @@ def test_a_failed_allocation_is_reported_as_such(monkeypatch: pytest.MonkeyPatch
     assert not is_out_of_memory(RuntimeError("shapes do not fit"))
     assert not is_out_of_memory(ValueError("the memory of a GRU is of no use here"))
     error = FULL[0]
-    there = r"^worlds: 64 worlds of Point on rank 0 need more memory than there is; set fewer"
-    with pytest.raises(UserError, match=there), memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
+    existing = r"^worlds: 64 worlds of Point on rank 0 need more memory than there is; set fewer"
+    with pytest.raises(UserError, match=existing), memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
         raise error  # 64 worlds would fit: somebody else took it
     monkeypatch.setattr(memory_estimate, "free_bytes", lambda gang: 100_000)
     little = r"than the 0.0 GB that are free: about 0.0 GB. (About \d+ fit|Not even one fits): set "
@@ -84,12 +84,12 @@ LEARNERS: dict[str, tuple[str, Any]] = {
 def test_more_worlds_than_fit_are_refused_before_they_are_built_whatever_learns(name: str) -> None:
     algorithm, settings = LEARNERS[name]
     learner = find_algorithm(algorithm), settings
-    there = (
+    existing = (
         r"^worlds: 200,000,000 worlds of Point on rank 0 need more memory than the [\d.]+ GB that are free: "
         r"about [\d,.]+ GB\. About [\d,]+ fit: set `worlds`$"
     )
     with (
-        pytest.raises(UserError, match=there),
+        pytest.raises(UserError, match=existing),
         memory_estimate.within_memory(POINT, CONFIG, learner, 200_000_000, HERE),
     ):
         pytest.fail("they are not to be built")

@@ -64,8 +64,8 @@ def saved_actor(path: Path, observations: int = 7, actions: int = 3, normalized:
     """An actor of rsl_rl that has met observations, and its checkpoint as rsl_rl writes it."""
     torch.manual_seed(3)
     example = TensorDict({"actor": torch.zeros(1, observations)}, batch_size=[1])
-    told: dict[str, Any] = {"class_name": GaussianDistribution, "init_std": 0.5}
-    shape = {"hidden_dims": (16, 8), "activation": "elu", "obs_normalization": normalized, "distribution_cfg": told}
+    reported: dict[str, Any] = {"class_name": GaussianDistribution, "init_std": 0.5}
+    shape = {"hidden_dims": (16, 8), "activation": "elu", "obs_normalization": normalized, "distribution_cfg": reported}
     actor = MLPModel(example, {"actor": ["actor"]}, "actor", actions, **shape)
     if normalized:
         actor.train()
@@ -131,8 +131,8 @@ def test_a_policy_of_mjlab_fits_a_task_of_the_same_order_alone() -> None:
 
 def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration(tmp_path: Path) -> None:
     shared = cases.find_case("ant").shared("muster", "ours")
-    asked = {**shared, "worlds": 2, "iterations": 1, "save_every": 1, "seed": 0, "steps": 4, "hidden_sizes": [8]}
-    loop = build_loop(asked, tmp_path, config={"substeps": 1})
+    requested = {**shared, "worlds": 2, "iterations": 1, "save_every": 1, "seed": 0, "steps": 4, "hidden_sizes": [8]}
+    loop = build_loop(requested, tmp_path, config={"substeps": 1})
     found = loop.task.solver_options
     loop.close()
     assert (found["iterations"], found["ls_iterations"]) == (3, 6)
@@ -140,7 +140,7 @@ def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration
 
 
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "output"),
     [
         ("muster --case g11", "there is no case 'g11'; did you mean g1?"),
         ("muster --iterations 10", "--iterations 10: of these 10 are not counted"),
@@ -153,12 +153,14 @@ def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration
         ("walking --task Ant", "--task Ant: it follows no velocity commands; there are Go1Flat, G1Flat"),
     ],
 )
-def test_invalid_options_of_the_commands_are_refused(words: str, said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_options_of_the_commands_are_refused(
+    words: str, output: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     name, *arguments = words.split()
     command = walking if name == "walking" else importlib.import_module(f"benchmarks.peers.{name}")
     with pytest.raises(SystemExit) as ended:
         command.main(arguments)
-    assert ended.value.code == 2 and said in capsys.readouterr().err
+    assert ended.value.code == 2 and output in capsys.readouterr().err
 
 
 BUSY = "while :; do :; done"
@@ -175,8 +177,8 @@ def test_a_machine_on_which_others_work_is_refused_or_marked(monkeypatch: pytest
     finally:
         os.kill(other, signal.SIGTERM)
     assert row["others"] > load.LIMIT
-    assert load.told([row]).startswith("**The machine was loaded.** Other processes used at most ")
-    assert "loaded" not in load.told([{"others": 0.01, "load_average": 0.2}])
+    assert load.reported([row]).startswith("**The machine was loaded.** Other processes used at most ")
+    assert "loaded" not in load.reported([{"others": 0.01, "load_average": 0.2}])
 
 
 def test_a_training_that_took_longer_than_its_rate_says_is_a_contradiction() -> None:

@@ -105,11 +105,11 @@ def test_a_checkpoint_whose_task_changed_is_refused_with_the_change(sliders: Sli
     check_contract(then, sliders, {})
     with pytest.raises(UserError) as caught:
         check_contract(then, Other(SlidersConfig(), 1), {})
-    said = str(caught.value)
-    assert said.startswith(
+    output = str(caught.value)
+    assert output.startswith(
         "checkpoint 00000004-e1 does not fit task Sliders as it is now: observation 0: place/first_place scale 2.0 became 1.0; "
     )
-    assert "action 0: first clip [-2.0, 2.0] became [-1.0, 1.0]" in said and "\n" not in said
+    assert "action 0: first clip [-2.0, 2.0] became [-1.0, 1.0]" in output and "\n" not in output
 
 
 def test_of_a_checkpoint_without_a_contract_sizes_are_compared(sliders: Sliders) -> None:
@@ -280,6 +280,6 @@ def test_the_kind_of_an_action_is_what_its_function_writes() -> None:
 
 
 def test_an_action_of_ones_own_for_actuators_that_take_different_things_is_refused() -> None:
-    there = "the actuators of its joints take a position and a velocity; declare an action for each"
-    with pytest.raises(ValueError, match=there):
+    existing = "the actuators of its joints take a position and a velocity; declare an action for each"
+    with pytest.raises(ValueError, match=existing):
         driven_by(press, PositionActuator("first", 20.0, 0.5), VelocityActuator("second", 0.5))

@@ -116,8 +116,8 @@ def test_an_optimizer_keeps_the_flags_of_its_own_device(device: bool) -> None:
     ppo.load_state_dict(state)
     (group,) = ppo.optimizer.param_groups
     assert group["capturable"] is device and group["fused"] and group["lr"] is ppo._rate
-    moments, there = ppo.optimizer.state_dict()["state"], state["optimizer"]["state"]
-    assert moments and all(torch.equal(moments[i]["exp_avg"], there[i]["exp_avg"]) for i in there)
+    moments, existing = ppo.optimizer.state_dict()["state"], state["optimizer"]["state"]
+    assert moments and all(torch.equal(moments[i]["exp_avg"], existing[i]["exp_avg"]) for i in existing)
 
 
 def test_noise_and_minibatches_belong_to_worlds_not_to_ranks() -> None:

@@ -81,8 +81,8 @@ def test_a_state_brings_back_both_networks_and_the_rate_unless_the_job_sets_anot
     saved._rate.fill_(5e-4)
     assert fresh.load_state_dict(saved.state_dict()) == [] and float(fresh._rate) == pytest.approx(5e-4)
     for name in ("actor", "critic"):
-        there, here = getattr(saved, name).state_dict(), getattr(fresh, name).state_dict()
-        assert all(torch.equal(there[key], here[key]) for key in there)
+        existing, here = getattr(saved, name).state_dict(), getattr(fresh, name).state_dict()
+        assert all(torch.equal(existing[key], here[key]) for key in existing)
     says = ["learning rate set to 0.002"]
     assert learner(learning_rate=2e-3).load_state_dict(saved.state_dict(), changed={"learning_rate"}) == says
     assert learner(learning_rate=2e-3, schedule="fixed").load_state_dict(saved.state_dict()) == says

@@ -88,10 +88,10 @@ def test_a_failed_report_is_logged_once_and_later_ones_are_written(capsys: pytes
         reporter.do({}.__getitem__, "reward")
     reporter.do(done.append, 1)
     reporter.close()
-    told = capsys.readouterr().out
+    reported = capsys.readouterr().out
     assert done == [1]
-    assert told.count("warning: a report failed (KeyError: 'reward'); training goes on without it\n") == 1
-    assert "warning: 3 reports failed and were lost" in told
+    assert reported.count("warning: a report failed (KeyError: 'reward'); training goes on without it\n") == 1
+    assert "warning: 3 reports failed and were lost" in reported
 
 
 def test_records_that_a_hanging_volume_refuses_are_dropped_and_counted(
@@ -125,7 +125,7 @@ def test_a_fence_reports_a_newer_attempt_and_reads_again_what_cannot_be_read(run
     fence.close()
 
 
-def said(run: Run, capsys: pytest.CaptureFixture[str], seconds: float, device: str, resumed: int) -> list[str]:
+def output(run: Run, capsys: pytest.CaptureFixture[str], seconds: float, device: str, resumed: int) -> list[str]:
     """The lines without an iteration's figures, of three iterations of 1,000 that take so long each."""
     job = SimpleNamespace(run=run, epoch=1, section={"task": "G1Rough"})
     report = Report(SimpleNamespace(job=job, iterations=1000), resumed, device)
@@ -156,7 +156,7 @@ DAYS = (
 def test_a_training_of_many_hours_without_a_gpu_is_warned_about_once_with_a_remedy(
     run: Run, capsys: pytest.CaptureFixture[str], seconds: float, device: str, resumed: int, warning: str
 ) -> None:
-    lines = said(run, capsys, seconds, device, resumed)
+    lines = output(run, capsys, seconds, device, resumed)
     assert len(lines) == bool(warning) and warning in "".join(lines) and (warning != DAYS or lines == [DAYS])
 
 

@@ -66,8 +66,8 @@ def arm(**changes: str) -> Reading:
 def test_a_changed_value_is_in_the_identity_and_named(change: str) -> None:
     changed, line = CHANGES[change]
     before, now = arm().identity, arm(**changed).identity
-    (said,) = robot_changes([before], [now])
-    assert line in said
+    (output,) = robot_changes([before], [now])
+    assert line in output
 
 
 def test_options_that_do_not_apply_do_not_count() -> None:

@@ -116,13 +116,13 @@ def test_a_file_that_newton_reads_otherwise_becomes_the_robot_that_mujoco_compil
     reading = read(file)
     assert reading.corrected
     both = twins(reading)
-    there, here = both.free_of_contacts()
+    existing, here = both.free_of_contacts()
     for field in ("nq", "nv", "nu", "na", "ntendon", "neq"):
-        assert getattr(here, field) == getattr(there, field)
-    assert here.body_mass.sum() == pytest.approx(there.body_mass.sum(), rel=1e-6)
+        assert getattr(here, field) == getattr(existing, field)
+    assert here.body_mass.sum() == pytest.approx(existing.body_mass.sum(), rel=1e-6)
     first, second = both.columns()
-    controls = np.full(there.nu, 0.2)
-    np.testing.assert_allclose(stepped(here, second, controls), stepped(there, first, controls), atol=1e-4)
+    controls = np.full(existing.nu, 0.2)
+    np.testing.assert_allclose(stepped(here, second, controls), stepped(existing, first, controls), atol=1e-4)
 
 
 @pytest.mark.parametrize("file", SAME.values(), ids=SAME)
@@ -145,7 +145,7 @@ def ends(tendon: str = "", equality: str = "", actuator: str = "", pair: str = "
 
 
 @pytest.mark.parametrize(
-    ("kind", "element", "here", "there", "words"),
+    ("kind", "element", "here", "existing", "words"),
     [
         ("equality", '<connect body1="{}" anchor="0 0 0" active="false"/>', "b", "c", "equality equality_0: body1"),
         ("equality", '<weld body1="c" body2="{}" active="false"/>', "b", "world", "equality equality_0: body2"),
@@ -192,10 +192,10 @@ def ends(tendon: str = "", equality: str = "", actuator: str = "", pair: str = "
         ("pair", '<pair geom1="{}" geom2="i"/>', "g", "h", "contact pair 0: existence"),
     ],
 )
-def test_an_end_on_another_element_is_found(kind: str, element: str, here: str, there: str, words: str) -> None:
+def test_an_end_on_another_element_is_found(kind: str, element: str, here: str, existing: str, words: str) -> None:
     built, reference = (
         read(ends(**{kind: element.format(here)})).builder,
-        read(ends(**{kind: element.format(there)})).reference,
+        read(ends(**{kind: element.format(existing)})).reference,
     )
     assert reference is not None
     found = [f"{each.element}: {each.field}" for each in robot_judge.compare(reference.model, built).differences]

@@ -37,16 +37,16 @@ def leg(assets: str = "", geoms: str = "", actuators: str = "") -> str:
     return LEG.format(assets=assets, geoms=geoms, actuators=actuators)
 
 
-def template(*things: Any) -> newton.ModelBuilder:
+def template(*items: Any) -> newton.ModelBuilder:
     builder = newton.ModelBuilder()
     SolverMuJoCo.register_custom_attributes(builder)
-    for thing in things:
-        thing.add_to(builder)
+    for item in items:
+        item.add_to(builder)
     return builder
 
 
-def build(*things: Any) -> Callable[[], Any]:
-    return lambda: template(*things)
+def build(*items: Any) -> Callable[[], Any]:
+    return lambda: template(*items)
 
 
 def robot(*actuators: Any, **options: Any) -> Callable[[], Any]:
@@ -122,8 +122,8 @@ CASES: dict[str, Callable[[], Any]] = {
 
 @pytest.mark.parametrize("parts", CASES)
 def test_a_mistake_is_reported_in_one_line(parts: str) -> None:
-    said = refusal(CASES[parts])
-    assert all(part in said for part in parts.split(" ... ")), said
+    output = refusal(CASES[parts])
+    assert all(part in output for part in parts.split(" ... ")), output
 
 
 @pytest.mark.parametrize(
@@ -138,8 +138,8 @@ def test_a_mistake_is_reported_in_one_line(parts: str) -> None:
 def test_a_file_that_is_not_there_is_refused_with_the_nearest(tmp_path: Path, name: str, parts: str) -> None:
     (tmp_path / "leg.xml").write_text(leg())
     (tmp_path / "leg.stl").write_text("")
-    said = refusal(lambda: template(Robot(tmp_path / name if name else tmp_path)))
-    assert all(part in said for part in parts.split(" ... ")), said
+    output = refusal(lambda: template(Robot(tmp_path / name if name else tmp_path)))
+    assert all(part in output for part in parts.split(" ... ")), output
 
 
 @pytest.mark.parametrize(
@@ -227,8 +227,8 @@ def mjcf(actuators: str, **options: Any) -> Callable[[newton.ModelBuilder], Any]
 def test_a_robot_that_no_action_would_move_is_refused(
     add: Callable[[newton.ModelBuilder], Any], parts: list[str]
 ) -> None:
-    said = refusal(worlds_of, add)
-    assert "\n" not in said and all(part in said for part in parts), said
+    output = refusal(worlds_of, add)
+    assert "\n" not in output and all(part in output for part in parts), output
 
 
 def test_the_same_servos_added_as_the_refusal_says_follow_their_controls() -> None:
@@ -250,8 +250,8 @@ def test_the_same_servos_added_as_the_refusal_says_follow_their_controls() -> No
     ],
 )
 def test_an_option_of_the_solver_that_is_not_a_task_s_is_refused(options: dict[str, Any], message: str) -> None:
-    said = refusal(worlds_of, mjcf('<motor joint="hinge"/>'), **options)
-    assert said.startswith("solver_options: ") and message in said and "\n" not in said
+    output = refusal(worlds_of, mjcf('<motor joint="hinge"/>'), **options)
+    assert output.startswith("solver_options: ") and message in output and "\n" not in output
 
 
 def test_no_other_exception_than_a_value_error_escapes() -> None:

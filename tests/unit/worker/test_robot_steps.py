@@ -82,16 +82,16 @@ def stepped(file: str, control: float) -> tuple[Any, Any]:
     data.ctrl[:] = control
     for _ in range(250):
         mujoco.mj_step(model, data)
-    there, here = twins(reading).columns()
-    return worlds.solver.mjw_data.qpos.numpy()[:, here], data.qpos[there]
+    existing, here = twins(reading).columns()
+    return worlds.solver.mjw_data.qpos.numpy()[:, here], data.qpos[existing]
 
 
 @pytest.mark.parametrize("file", ARMATURES.values(), ids=ARMATURES)
 def test_an_actuators_armature_slows_the_joint_in_a_world_as_in_mujoco(file: str) -> None:
-    here, there = stepped(file, 0.5)
+    here, existing = stepped(file, 0.5)
     without = stepped(file.replace('armature=".2"', ""), 0.5)[1]
-    assert np.abs(without - there).max() > 5e-3
-    np.testing.assert_allclose(here, [there, there], atol=1e-5)
+    assert np.abs(without - existing).max() > 5e-3
+    np.testing.assert_allclose(here, [existing, existing], atol=1e-5)
 
 
 @pytest.mark.parametrize(("bodies", "equalities", "control"), SOFT.values(), ids=SOFT)
@@ -99,8 +99,8 @@ def test_contacts_and_equalities_of_bodies_that_only_slide_are_as_soft_as_in_muj
     bodies: str, equalities: str, control: float
 ) -> None:
     text = f'<mujoco><worldbody>{bodies}</worldbody>{equalities}<actuator><motor joint="x"/></actuator></mujoco>'
-    here, there = stepped(text, control)
-    np.testing.assert_allclose(here, [there, there], atol=5e-4)
+    here, existing = stepped(text, control)
+    np.testing.assert_allclose(here, [existing, existing], atol=5e-4)
 
 
 @pytest.mark.parametrize("options", ['density="100" wind="3 0 0"', 'actuatorgroupdisable="0"'])

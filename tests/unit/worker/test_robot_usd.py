@@ -167,8 +167,8 @@ def test_joints_begin_where_the_file_places_its_bodies(tmp_path: Path) -> None:
     assert reading.lines()[0].startswith("built as USD's schema reads its file; Newton's importer differs in 1 value")
     state = "float state:angular:physics:position = 20"
     (tmp_path / "state").mkdir()
-    given = read(usd(tmp_path / "state", joint=state))
-    assert RobotView(given.builder, "").defaults == pytest.approx([math.radians(20.0)]) and not given.corrected
+    supplied = read(usd(tmp_path / "state", joint=state))
+    assert RobotView(supplied.builder, "").defaults == pytest.approx([math.radians(20.0)]) and not supplied.corrected
 
 
 def test_a_joint_from_a_body_to_the_world_turns_the_way_the_file_says(tmp_path: Path) -> None:
@@ -201,8 +201,8 @@ def test_values_of_the_importer_that_differ_are_corrected(tmp_path: Path, monkey
     """Each value is spoilt behind the importer's back."""
     add = newton.ModelBuilder.add_usd
 
-    def spoilt(self: newton.ModelBuilder, *given: Any, **options: Any) -> Any:
-        found = add(self, *given, **options)
+    def spoilt(self: newton.ModelBuilder, *supplied: Any, **options: Any) -> Any:
+        found = add(self, *supplied, **options)
         self.body_mass[1], self.body_com[1] = 9.0, self.body_com[1] + type(self.body_com[1])(0.1, 0.0, 0.0)
         self.body_inertia[1] = self.body_inertia[1] * 2.0
         self.joint_limit_lower[6], self.joint_armature[6], self.joint_friction[6], self.joint_damping[6] = 1, 2, 3, 4

@@ -18,15 +18,15 @@ from worker.settings.rsl_rl import RslRlConfig
 
 
 def test_a_section_with_a_class_is_used_unchanged_and_one_without_overrides_the_defaults() -> None:
-    given = {"class_name": "MLPModel", "hidden_dims": [7]}
-    config = settings({"critic": given, "actor": {"hidden_dims": [5], "distribution_cfg": {"init_std": 0.3}}})
-    assert config.section("critic") == given
+    supplied = {"class_name": "MLPModel", "hidden_dims": [7]}
+    config = settings({"critic": supplied, "actor": {"hidden_dims": [5], "distribution_cfg": {"init_std": 0.3}}})
+    assert config.section("critic") == supplied
     normal = {"class_name": "GaussianDistribution", "init_std": 0.3}
     expected = {"class_name": "MLPModel", "hidden_dims": [5], "activation": "elu", "obs_normalization": True}
     assert config.section("actor") == {**expected, "distribution_cfg": normal}
     config.section("actor")["distribution_cfg"]["init_std"] = 9.0
     assert RslRlConfig().section("actor")["distribution_cfg"]["init_std"] == 1.0
-    assert json.loads(json.dumps(dataclasses.asdict(config)))["critic"] == given
+    assert json.loads(json.dumps(dataclasses.asdict(config)))["critic"] == supplied
 
 
 def ppo(**keys: Any) -> dict[str, Any]:
@@ -100,6 +100,6 @@ def test_settings_that_rsl_rl_takes_are_taken(section: dict[str, Any]) -> None:
 def test_every_key_that_rsl_rl_s_classes_take_is_known(kind: str) -> None:
     """But for what their runner gives them."""
     taken = set(inspect.signature(getattr(rsl_rl.algorithms, kind)).parameters)
-    given = {"actor", "critic", "student", "teacher", "storage", "device", "multi_gpu_cfg", "kwargs"}
+    supplied = {"actor", "critic", "student", "teacher", "storage", "device", "multi_gpu_cfg", "kwargs"}
     known = set(checks._SECTIONS[kind].json_schema()["properties"])
-    assert taken - given <= known and known - taken <= {"class_name", "share_cnn_encoders"}
+    assert taken - supplied <= known and known - taken <= {"class_name", "share_cnn_encoders"}

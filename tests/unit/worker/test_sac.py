@@ -123,8 +123,8 @@ def test_a_small_replay_is_saved_and_a_large_one_is_not(
     assert make(task).world_state() and not capsys.readouterr().out
     monkeypatch.setitem(SAVED, "cpu", size - 1)
     assert make(task).world_state() == {}
-    told = "checkpoints do not hold the replay, 0 MiB a rank: a run that is resumed fills a new one first "
-    assert capsys.readouterr().out.startswith(told)
+    reported = "checkpoints do not hold the replay, 0 MiB a rank: a run that is resumed fills a new one first "
+    assert capsys.readouterr().out.startswith(reported)
     assert make(task, save_replay=True).world_state() and not make(task, save_replay=False).world_state()
     make(point(2), gang=Half(1), share=WorldShare(3, 2, 5))
     SAC(SMALL, dataclasses.replace(setting_of(task), rehearsal=True))

@@ -69,12 +69,12 @@ def test_only_what_is_there_is_drawn_and_all_of_it(n_step: int) -> None:
         replay = ReplayBuffer(capacity, worlds, 1, 1, n_step, 0.9, "cpu")
         fill(replay, recorded)
         rows = torch.zeros(4000, dtype=torch.int64)
-        there = replay.draw(rows, generator)
-        assert there == (recorded >= n_step)
-        if there:
-            begun = (replay.sample(rows).before[:, 0] / 100.0).floor()
+        existing = replay.draw(rows, generator)
+        assert existing == (recorded >= n_step)
+        if existing:
+            started = (replay.sample(rows).before[:, 0] / 100.0).floor()
             expected = torch.arange(max(0, recorded - capacity), recorded - n_step + 1)
-            assert torch.equal(begun.unique(), expected.float())
+            assert torch.equal(started.unique(), expected.float())
             found = replay.sample(rows).before[:, 0].unique()
             assert len(found) == len(expected) * worlds
 

@@ -63,11 +63,11 @@ def test_how_critics_are_combined(combine: Any) -> None:
     config = SACConfig(atoms=3, v_min=0.0, v_max=2.0, critics=2, combine=combine, critic_sizes=(4,))
     critics = Critics(config, 2, 1)
     # means ¾ 2, 1¼ 1½
-    given = torch.tensor([[[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]], [[0.25, 0.25, 0.5], [0.0, 0.5, 0.5]]])
-    outputs = given.clamp(min=1e-30).log()
+    supplied = torch.tensor([[[0.5, 0.25, 0.25], [0.0, 0.0, 1.0]], [[0.25, 0.25, 0.5], [0.0, 0.5, 0.5]]])
+    outputs = supplied.clamp(min=1e-30).log()
     together = {"mean": [1.0, 1.75], "min": [0.75, 1.5]}[combine]
     torch.testing.assert_close(critics.combined_mean(outputs), torch.tensor(together))
-    chosen = {"mean": given.mean(0), "min": torch.stack((given[0, 0], given[1, 1]))}[combine]
+    chosen = {"mean": supplied.mean(0), "min": torch.stack((supplied[0, 0], supplied[1, 1]))}[combine]
     torch.testing.assert_close(critics.combined_distribution(outputs), chosen)
     single = Critics(dataclasses.replace(config, atoms=1), 2, 1)
     mean = single.combined_mean(torch.tensor([[[1.0], [4.0]], [[3.0], [2.0]]]))

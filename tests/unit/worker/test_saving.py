@@ -65,7 +65,7 @@ def test_saves_are_committed_in_order_and_verify(run: Run) -> None:
 def test_a_copy_that_is_still_being_written_is_not_written_over(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second copy waits for the thread, which writes the first one into memory."""
     saver, save, goes_on = Saver(run, 1, 0, 1, keep=None), torch.save, threading.Event()
-    monkeypatch.setattr(torch, "save", lambda *given: (goes_on.wait(), save(*given)))
+    monkeypatch.setattr(torch, "save", lambda *supplied: (goes_on.wait(), save(*supplied)))
     saver.save(1, {"learner.pt": saver.copy({"value": torch.ones(3)})}, {})
     second = threading.Thread(target=saver.copy, args=({"value": torch.zeros(3)},))
     second.start()
@@ -142,8 +142,8 @@ def test_a_file_is_durable_before_its_writer_tells_the_others(run: Run, monkeypa
     os.close(memory)
     making = run.checkpoints / ".00000001-e1.tmp"
     assert answer["written"] == "00000001-e1" and (making / "rank-1.pt").read_bytes() == b"state"
-    told = seen.index(("rename", str(making / ".rank-1.json")))
-    assert ("fsync", str(making / "rank-1.pt")) in seen[:told]
+    reported = seen.index(("rename", str(making / ".rank-1.json")))
+    assert ("fsync", str(making / "rank-1.pt")) in seen[:reported]
 
 
 def test_auto_saves_as_often_as_one_percent_allows() -> None:
@@ -181,8 +181,11 @@ def test_a_commit_waits_for_the_metrics_before_it_for_a_while(run: Run, monkeypa
     assert saver.wait() == ["checkpoint 00000001-e1"]
     monkeypatch.setattr(saving, "RECORDS_SECONDS", 0.2)
     saver.save(2, content(2), {}, after_records=True)
-    told = saver.wait()
-    assert told[0] == "checkpoint 00000002-e1" and "was committed before the metrics up to it were written" in told[1]
+    reported = saver.wait()
+    assert (
+        reported[0] == "checkpoint 00000002-e1"
+        and "was committed before the metrics up to it were written" in reported[1]
+    )
     saver.close()
 
 
@@ -195,7 +198,9 @@ def test_a_save_does_not_wait_for_a_volume_that_hangs(run: Run, monkeypatch: pyt
     why = "earlier saves are still being written"
     assert saver.poll() == [f"warning: iteration 3 could not be saved ({why}); training goes on"]
     monkeypatch.setattr(
-        select, "select", lambda *given: pytest.fail("the oldest was waited for already") if given[3] else ([], [], [])
+        select,
+        "select",
+        lambda *supplied: pytest.fail("the oldest was waited for already") if supplied[3] else ([], [], []),
     )
     saver.save(4, content(4), {}, wait=False)
     monkeypatch.undo()

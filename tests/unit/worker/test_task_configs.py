@@ -79,13 +79,13 @@ def test_a_plain_dataclass_is_checked_by_the_types_of_its_fields() -> None:
     config = configure(Torqued, {"config": {"torque": 2, "randomize": {"mass": [1, 2]}, "rewards": {"effort": -1}}})
     assert type(config) is PendulumConfig and isinstance(config.torque, float)
     assert config == PendulumConfig(torque=2.0, randomize=Randomization(mass=(1.0, 2.0)), rewards={"effort": -1.0})
-    for overrides, said in (
+    for overrides, output in (
         ({"torqe": 1}, "torqe: PendulumConfig has no such key; did you mean torque?"),
         ({"torque": "much"}, "torque: expected a number, found a string ('much')"),
         ({"episode_seconds": -1}, "episode_seconds: expected a value greater than 0, found -1.0"),
         ({"rewards": {"speed": float("nan")}}, "rewards.speed: expected a finite number, found a number (nan)"),
     ):
-        assert refusal(configure, Torqued, {"config": overrides}, error=UserError) == f"train.config.{said}"
+        assert refusal(configure, Torqued, {"config": overrides}, error=UserError) == f"train.config.{output}"
 
 
 def test_a_plain_dataclass_that_python_makes_is_checked_in_what_every_task_has() -> None:
@@ -133,14 +133,14 @@ def test_a_users_configuration_may_be_a_plain_or_a_pydantic_dataclass(kind: type
     )
     assert type(made) is kind and (made.sizes, made.corners, made.limit) == ((4,), ((1.0, 2.0),), 3.0)
     assert (made.camera.width, made.camera.fov, made.rewards, made.ppo.steps) == (8, 0.5, {"near": 2.0}, 7)
-    for overrides, said in (
+    for overrides, output in (
         ({"sizes": [4, "x"]}, "sizes.1: expected an integer, found a string ('x')"),
         ({"limit": "low"}, "limit: expected a number, found a string ('low')"),
         ({"limit": 0}, "limit: 0 leaves no room"),
         ({"camera": {"fov": 4}}, "camera.fov: expected a value less than 3.141592653589793, found 4"),
         ({"ppo": {"steps": 8}}, f"ppo: not a key of {kind.__name__}; settings of ppo stand under train.ppo"),
     ):
-        assert refusal(configured, kind, overrides, error=Refused) == said
+        assert refusal(configured, kind, overrides, error=Refused) == output
 
 
 def test_a_task_with_invalid_defaults_says_so() -> None:
@@ -164,8 +164,8 @@ def test_a_yaml_changes_the_weights_that_it_names() -> None:
 
 
 def test_an_infinite_end_of_a_range_is_refused_by_a_rank_too() -> None:
-    said = refusal(configure, Quadruped, {"config": {"command_turn": [0.0, math.inf]}}, error=UserError)
-    assert said == "train.config.command_turn: expected [least, greatest], found [0.0, inf]"
+    output = refusal(configure, Quadruped, {"config": {"command_turn": [0.0, math.inf]}}, error=UserError)
+    assert output == "train.config.command_turn: expected [least, greatest], found [0.0, inf]"
 
 
 TASK = """import warp as wp
@@ -192,7 +192,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def told(folder: Path, name: str, text: str) -> str:
+def reported(folder: Path, name: str, text: str) -> str:
     """What is said of a task whose module has this text."""
     (folder / f"{name}.py").write_text(text)
     with pytest.raises(TaskMistake) as mistake, task_mistakes(f"{name}:Bad"):
@@ -215,16 +215,18 @@ def told(folder: Path, name: str, text: str) -> str:
     ids=["term", "name", "key", "value", "file"],
 )
 def test_an_error_in_a_method_of_a_task_names_its_line(folder: Path, robot: str, declare: str, words: str) -> None:
-    said = told(folder, "mistaken", TASK.format(robot=robot, declare=declare))
-    assert said.startswith(f"task mistaken:Bad: mistaken.py:{words}")
-    assert "sqared" not in declare or said.endswith("did you mean joint_velocity_squared?")
+    output = reported(folder, "mistaken", TASK.format(robot=robot, declare=declare))
+    assert output.startswith(f"task mistaken:Bad: mistaken.py:{words}")
+    assert "sqared" not in declare or output.endswith("did you mean joint_velocity_squared?")
 
 
 def test_an_error_at_the_import_names_its_line(folder: Path) -> None:
-    assert told(folder, "unclosed", "x = (\n") == "task unclosed:Bad: unclosed.py:1: SyntaxError: '(' was never closed"
-    said = told(folder, "misnamed", "\nfrom worker.tasks import Rewrd\n")
-    assert said.startswith("task misnamed:Bad: misnamed.py:2: ImportError: cannot import name 'Rewrd'")
-    assert said.endswith("did you mean Reward?")
+    assert (
+        reported(folder, "unclosed", "x = (\n") == "task unclosed:Bad: unclosed.py:1: SyntaxError: '(' was never closed"
+    )
+    output = reported(folder, "misnamed", "\nfrom worker.tasks import Rewrd\n")
+    assert output.startswith("task misnamed:Bad: misnamed.py:2: ImportError: cannot import name 'Rewrd'")
+    assert output.endswith("did you mean Reward?")
 
 
 def test_a_function_that_warp_cannot_compile_is_named_first(folder: Path) -> None:

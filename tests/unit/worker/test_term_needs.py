@@ -158,8 +158,8 @@ REFUSED: Mapping[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("message", REFUSED)
 def test_a_term_whose_needs_the_task_does_not_meet_is_refused(message: str) -> None:
-    said = refusal(sliders(**REFUSED[message]).sketch, SlidersConfig())
-    assert said.startswith(f"task Changed: {message}") and (said.endswith(message) or "slide" not in message)
+    output = refusal(sliders(**REFUSED[message]).sketch, SlidersConfig())
+    assert output.startswith(f"task Changed: {message}") and (output.endswith(message) or "slide" not in message)
 
 
 @wp.struct
@@ -197,6 +197,6 @@ def _mixed_up(task: Sliders) -> torch.Tensor:
 
 
 def test_a_torch_term_of_another_shape_is_refused() -> None:
-    wanted = r"observations.a: _mixed_up gives \(2, 3\); expected a tensor of shape \(3, 2\), as size= says$"
-    with pytest.raises(ValueError, match=wanted):
+    requested = r"observations.a: _mixed_up gives \(2, 3\); expected a tensor of shape \(3, 2\), as size= says$"
+    with pytest.raises(ValueError, match=requested):
         sliders(observations={"a": Observation(_mixed_up, size=2)})(SlidersConfig(), 3)

@@ -76,31 +76,31 @@ def write(run: Run, epoch: int, resumed_from: int, last: int) -> None:
             writer.write({"iteration": iteration, "reward": float(epoch), "time": 1.0})
 
 
-def sender(run: Run, service: Memory, said: list[str], settings: Mapping[str, Any] = TRAIN) -> Sender:
-    return Sender(run, service, "memory", settings, said.append)
+def sender(run: Run, service: Memory, output: list[str], settings: Mapping[str, Any] = TRAIN) -> Sender:
+    return Sender(run, service, "memory", settings, output.append)
 
 
 def test_a_resumed_attempt_with_the_same_settings_sends_no_iteration_twice(run: Run) -> None:
-    service, said = Memory(), list[str]()
+    service, output = Memory(), list[str]()
     write(run, 1, 0, 10)
-    assert sender(run, service, said).step(0, 1)
+    assert sender(run, service, output).step(0, 1)
     write(run, 2, 6, 12)  # killed at 10, it goes on from a checkpoint of 6
-    assert sender(run, service, said).step(6, 2)
+    assert sender(run, service, output).step(6, 2)
     assert service.sent == {"ant": [(i, 1.0) for i in range(1, 11)] + [(11, 2.0), (12, 2.0)]}
-    assert said == ["memory of ant"] * 2 and service.left == []
+    assert output == ["memory of ant"] * 2 and service.left == []
 
 
 def test_iterations_that_are_done_again_with_other_settings_begin_a_new_run_with_the_whole_history(run: Run) -> None:
-    service, said = Memory(), list[str]()
+    service, output = Memory(), list[str]()
     write(run, 1, 0, 10)
-    assert sender(run, service, said).step(0, 1)
+    assert sender(run, service, output).step(0, 1)
     write(run, 2, 6, 8)
     others = {**TRAIN, "ppo": {"learning_rate": 0.1}}
-    assert sender(run, service, said, others).step(6, 2)
+    assert sender(run, service, output, others).step(6, 2)
     assert service.sent["ant"] == [(i, 1.0) for i in range(1, 11)] and service.left == ["ant"]
     assert service.sent["ant-e2"] == [(i, 1.0) for i in range(1, 7)] + [(7, 2.0), (8, 2.0)]
     write(run, 3, 8, 9)  # and that is the run from then on
-    assert sender(run, service, said, others).step(8, 3)
+    assert sender(run, service, output, others).step(8, 3)
     assert service.sent["ant-e2"][-1] == (9, 3.0)
 
 
@@ -142,8 +142,8 @@ def test_one_process_at_a_time_sends_a_run_and_the_next_one_learns_who_does(
 def test_an_unreachable_service_is_reported_in_one_line_and_everything_is_sent_later(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    service, said = Memory(), list[str]()
-    sending = sender(run, service, said)
+    service, output = Memory(), list[str]()
+    sending = sender(run, service, output)
     write(run, 1, 0, 3)
     assert sending.step(0, 1)
     service.trouble = ConnectionError("no route\nto http://me:word@host/")
@@ -156,7 +156,7 @@ def test_an_unreachable_service_is_reported_in_one_line_and_everything_is_sent_l
     assert sending.step(0, 1)
     assert [step for step, _ in service.sent["ant"]] == list(range(1, 701))
     warning = "warning: nothing can be sent now (no route to http://host/)"
-    assert said[1:] == [warning, "it answers again; everything is sent"]
+    assert output[1:] == [warning, "it answers again; everything is sent"]
 
 
 class Later:
@@ -195,9 +195,9 @@ def test_a_records_numbers_have_the_names_that_tensorboard_shows() -> None:
     assert scalars(record) == {"episode/length": 7.5, "train/kl": 0.01, "train/nan_worlds": 0}
 
 
-def job(run: Run, **wanted: Any) -> Job:
+def job(run: Run, **requested: Any) -> Job:
     raise_epoch(run, 1)
-    return Job({"train": TRAIN, "track": wanted}, Store(run.path.parent.parent), run, 1, 1, "id", section=TRAIN)
+    return Job({"train": TRAIN, "track": requested}, Store(run.path.parent.parent), run, 1, 1, "id", section=TRAIN)
 
 
 def test_another_rank_than_the_main_one_tracks_nothing(run: Run) -> None:
@@ -207,7 +207,7 @@ def test_another_rank_than_the_main_one_tracks_nothing(run: Run) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "output"),
     [
         (["RUN"], "error: usage: python -m worker.track RUN_DIRECTORY wandb|mlflow"),
         (["RUN", "neptune"], "error: no service is called neptune; there are: wandb, mlflow"),
@@ -215,11 +215,11 @@ def test_another_rank_than_the_main_one_tracks_nothing(run: Run) -> None:
     ],
 )
 def test_a_run_that_cannot_be_sent_afterwards_is_reported_in_one_line(
-    run: Run, arguments: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    run: Run, arguments: list[str], output: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["track", *(str(run.path) if each == "RUN" else each for each in arguments)])
     monkeypatch.delitem(sys.modules, "worker.track")
     with pytest.raises(SystemExit) as ended:
         runpy.run_module("worker.track", run_name="__main__")
     out, errors = capsys.readouterr()
-    assert (ended.value.code, out, errors.count("\n")) == (2, "", 1) and said in errors
+    assert (ended.value.code, out, errors.count("\n")) == (2, "", 1) and output in errors

@@ -26,7 +26,7 @@ def record(iteration: int, reward: float | None = None, **figures: Any) -> dict[
     return {"iteration": iteration, "reward": reward, "episodes": 0 if reward is None else 10, **figures}
 
 
-def begun(of: Watch, returns: list[float]) -> list[list[str]]:
+def started(of: Watch, returns: list[float]) -> list[list[str]]:
     return [of.warnings(record(i, reward)) for i, reward in enumerate(returns, 1)]
 
 
@@ -36,7 +36,7 @@ RISE = [*([1.0] * 20), *([21.0] * 20)]
 
 @pytest.mark.parametrize(("fallen", "reported"), [(14.0, True), (15.5, False)])
 def test_a_fall_below_the_share_of_the_gain_is_reported_after_fifty_iterations(fallen: float, reported: bool) -> None:
-    found = begun(watch(), [*RISE, *([fallen] * 100)])
+    found = started(watch(), [*RISE, *([fallen] * 100)])
     first = next((i for i, texts in enumerate(found, 1) if texts), None)
     # the mean of 20 iterations is below 15 from the twentieth of 14.0 on, that is after iteration 58 (19 of 14 and one of 21 are 14.35)
     assert (first is not None) == reported and (not reported or 40 + 50 < first <= 60 + 50)
@@ -47,20 +47,20 @@ def test_a_fall_below_the_share_of_the_gain_is_reported_after_fifty_iterations(f
 
 
 def test_a_fall_that_ends_in_time_or_that_noise_explains_is_not_reported() -> None:
-    assert not any(begun(watch(), [*RISE, *([14.0] * 45), *([21.0] * 100)]))
+    assert not any(started(watch(), [*RISE, *([14.0] * 45), *([21.0] * 100)]))
     noisy = [3.0 * math.sin(1000.0 * i) for i in range(300)]  # no gain: what is lost of it says nothing
-    assert not any(begun(watch(), noisy))
+    assert not any(started(watch(), noisy))
 
 
 def test_an_end_below_the_best_names_the_checkpoint_to_try() -> None:
-    found = begun(watch(60), [*RISE, *([18.5] * 20)])
+    found = started(watch(60), [*RISE, *([18.5] * 20)])
     assert not any(found[:-1])
     assert found[-1] == [
         "it ended below its best: its mean return over 20 iterations is 18.50; it was 21.00 at iteration 40; try its best checkpoint: muster evaluate RUN@best"
     ]
-    assert not any(begun(watch(60), [*RISE, *([20.0] * 20)]))
+    assert not any(started(watch(60), [*RISE, *([20.0] * 20)]))
     shifted = [900.0 + value for value in (*RISE, *([15.0] * 20))]
-    assert "ended below" in begun(watch(60), shifted)[-1][0], "the gain counts, wherever the returns begin"
+    assert "ended below" in started(watch(60), shifted)[-1][0], "the gain counts, wherever the returns begin"
 
 
 @pytest.mark.parametrize(("deviation", "reported"), [(0.003, True), (0.05, False), (0.0, False), (None, False)])

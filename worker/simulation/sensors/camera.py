@@ -208,10 +208,10 @@ class Camera(Sensor):
         self._update_poses()
 
     def _displace(
-        self, stream: int, position: Any, angle: Any, given: wp.array[wp.transform], poses: wp.array[wp.transform]
+        self, stream: int, position: Any, angle: Any, supplied: wp.array[wp.transform], poses: wp.array[wp.transform]
     ) -> None:
-        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, given]
-        wp.launch(displace, dim=given.shape, inputs=inputs, outputs=[poses], device=self._device)
+        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, supplied]
+        wp.launch(displace, dim=supplied.shape, inputs=inputs, outputs=[poses], device=self._device)
 
     def _update_poses(self) -> None:
         inputs = [self._bodies, self._body, self._mounts, self.arrays]
@@ -348,11 +348,11 @@ class CameraSensor(SensorDeclaration):
         """Names of the channels of one frame, with these robots and objects. Raises ValueError where ``of`` names another."""
         if self.kind != "segmentation":
             return CHANNELS[self.kind]
-        there = (*views, *((GROUND,) if GROUND not in views else ()))
+        existing = (*views, *((GROUND,) if GROUND not in views else ()))
         for name in self.of if self.of is not None else ():
-            if name not in there:
-                raise ValueError(f"CameraSensor.of: there is no robot or object {name!r}; {nearest(name, there)}")
-        return tuple(self.of) if self.of is not None else there
+            if name not in existing:
+                raise ValueError(f"CameraSensor.of: there is no robot or object {name!r}; {nearest(name, existing)}")
+        return tuple(self.of) if self.of is not None else existing
 
     def rows(self, views: Mapping[str, RobotView]) -> list[str]:
         """Name of each channel of an observation, those of earlier frames ending on ``_1``, ``_2``, …

@@ -23,7 +23,7 @@ class IkArrays:
             targets are computed from it after all actions are written; then it is reset to 0.
     """
 
-    wanted: wp.array2d[wp.float32]
+    target: wp.array2d[wp.float32]
 
 
 @wp.struct
@@ -94,11 +94,11 @@ def _movement(chain: Chain, bodies: BodyArrays, world: int, joint: int, position
 
 
 @wp.func
-def _turn_to(here: wp.quat, wanted: wp.quat) -> wp.vec3:
+def _turn_to(here: wp.quat, target: wp.quat) -> wp.vec3:
     """Rotation vector, the shorter way, from one orientation to another [rad]; none where ``wanted`` has no length."""
-    if wp.length(wanted) < 1.0e-6:
+    if wp.length(target) < 1.0e-6:
         return wp.vec3(0.0, 0.0, 0.0)
-    between = wp.normalize(wanted) * wp.quat_inverse(here)
+    between = wp.normalize(target) * wp.quat_inverse(here)
     if between[3] < 0.0:
         between = -between
     imaginary = wp.vec3(between[0], between[1], between[2])
@@ -113,19 +113,19 @@ def _fill_errors(chain: Chain, ik: IkArrays, world: int, base: wp.transform, fra
     here = wp.transform_multiply(wp.transform_inverse(base), frame)
     turn = wp.vec3(0.0, 0.0, 0.0)
     if chain.turn >= 0:
-        wanted = wp.quat(
-            ik.wanted[world, chain.turn],
-            ik.wanted[world, chain.turn + 1],
-            ik.wanted[world, chain.turn + 2],
-            ik.wanted[world, chain.turn + 3],
+        target = wp.quat(
+            ik.target[world, chain.turn],
+            ik.target[world, chain.turn + 1],
+            ik.target[world, chain.turn + 2],
+            ik.target[world, chain.turn + 3],
         )
-        turn = _turn_to(wp.transform_get_rotation(here), wanted)
+        turn = _turn_to(wp.transform_get_rotation(here), target)
     for equation in range(chain.rows.shape[0]):
         row = chain.rows[equation]
         if chain.absolute and row >= 3:
             chain.errors[equation, world] = turn[row - 3]
         else:
-            error = ik.wanted[world, chain.columns[equation]]
+            error = ik.target[world, chain.columns[equation]]
             if chain.absolute:
                 error -= wp.transform_get_translation(here)[row]
             chain.errors[equation, world] = error
@@ -218,8 +218,8 @@ def move_frame(worlds: WorldArrays, bodies: BodyArrays, robot: RobotArrays, chai
         target = wp.clamp(wp.clamp(target, place - chain.max_step, place + chain.max_step), ends[0], ends[1])
         chain.targets[world, index] = target
         worlds.controls[world, robot.actuators[joint]] = target + robot.references[joint]
-    for column in range(ik.wanted.shape[1]):
-        ik.wanted[world, column] = 0.0
+    for column in range(ik.target.shape[1]):
+        ik.target[world, column] = 0.0
 
 
 @wp.kernel

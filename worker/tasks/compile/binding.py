@@ -127,13 +127,13 @@ class Binder:
         with placed(place):
             found = signature(term.function)
         bound = Bound(place, term, found, width=max(found.width, 1))
-        given = dict(found.defaults) | term.parameters
+        supplied = dict(found.defaults) | term.parameters
         if found.element:
             if not element:
                 raise ValueError(
                     f"{place}: {found.name} has a parameter {found.element}, which there is nothing for here"
                 )
-            bound.elements, bound.element_names = self._elements(place, term, found, given)
+            bound.elements, bound.element_names = self._elements(place, term, found, supplied)
         self._check_robot(bound)
         known = [name for name, kind in found.parameters.items() if is_named(name, kind, found)]
         for name in term.parameters:
@@ -142,7 +142,7 @@ class Binder:
                     f"{place}: {found.name} has no parameter {name}; {nearest(name, known) or 'it takes none'}"
                 )
         for name, kind in found.parameters.items():
-            bound.arguments[name] = self._argument(bound, name, kind, given, own or {})
+            bound.arguments[name] = self._argument(bound, name, kind, supplied, own or {})
         return bound
 
     def _bind_torch(self, place: str, term: Term) -> Bound:
@@ -162,10 +162,10 @@ class Binder:
             raise ValueError(f"{place}: {term.function_name}: {error}") from error
         return bound
 
-    def _indices(self, place: str, term: Term, found: Signature, given: Mapping[str, Any]) -> list[str]:
+    def _indices(self, place: str, term: Term, found: Signature, supplied: Mapping[str, Any]) -> list[str]:
         """Names of the elements that a parameter ``index`` counts: columns of sensors, numbers of a command, or ``size`` of them."""
         needed = needs_of(term.function)
-        names, what = self._counted(place, found, given, needed)
+        names, what = self._counted(place, found, supplied, needed)
         if term.size is None:
             if not names:
                 raise ValueError(f"{place}: say how often {found.name} is called, with size=")
@@ -174,12 +174,14 @@ class Binder:
             raise ValueError(f"{place}: size is {term.size}, more than the {len(names)} {what}; leave size= out")
         return [str(index) for index in range(term.size)]
 
-    def _counted(self, place: str, found: Signature, given: Mapping[str, Any], needed: Needs) -> tuple[list[str], str]:
+    def _counted(
+        self, place: str, found: Signature, supplied: Mapping[str, Any], needed: Needs
+    ) -> tuple[list[str], str]:
         """Names of the values of an index, and a word for what they are; none if the function does not say."""
         if needed.size:
             return [str(index) for index in range(needed.size)], f"elements of {found.name}"
         if needed.numbers:
-            name = self._command_name(place, given.get("command"))
+            name = self._command_name(place, supplied.get("command"))
             return [str(index) for index in range(self.visible[name])], f"numbers of the command {name}"
         counts: dict[str, int] = {}
         names: list[str] = []
@@ -188,10 +190,10 @@ class Binder:
                 continue
             if needed.columns is not None and parameter not in needed.columns:
                 continue
-            sensor = self._sensor(place, parameter, kind, given.get(parameter))
+            sensor = self._sensor(place, parameter, kind, supplied.get(parameter))
             rows: list[str] = self.sensors[sensor].rows(self.views)
             if needed.points and kind is HeightScanArrays:
-                rows = self._frames_of(place, sensor, rows, needed.points, given)
+                rows = self._frames_of(place, sensor, rows, needed.points, supplied)
             counts[sensor] = len(rows)
             names = names or rows
         if len(set(counts.values())) > 1:
@@ -202,9 +204,9 @@ class Binder:
         return names, f"{'frames' if needed.points else 'columns'} of {', '.join(counts)}"
 
     @staticmethod
-    def _frames_of(place: str, sensor: str, rows: list[str], points: str, given: Mapping[str, Any]) -> list[str]:
+    def _frames_of(place: str, sensor: str, rows: list[str], points: str, supplied: Mapping[str, Any]) -> list[str]:
         """The frames of a height scan; each has as many columns as the number ``points`` says."""
-        count = given.get(points)
+        count = supplied.get(points)
         if isinstance(count, bool) or not isinstance(count, int) or count < 1 or len(rows) % count:
             raise ValueError(
                 f"{place}: {points} is {shown(count)}, and the scan {sensor} has {len(rows)} columns; "
@@ -248,12 +250,12 @@ class Binder:
         return max(count, term.memory)
 
     def _elements(
-        self, place: str, term: Term, found: Signature, given: Mapping[str, Any]
+        self, place: str, term: Term, found: Signature, supplied: Mapping[str, Any]
     ) -> tuple[list[int], list[str]]:
         element = found.element
         assert element is not None
         if element == "index":
-            names = self._indices(place, term, found, given)
+            names = self._indices(place, term, found, supplied)
             return list(range(len(names))), names
         if element == "action":
             if not self.actions:
@@ -270,7 +272,7 @@ class Binder:
             raise ValueError(f"{place}: the task has no robot or object {name!r}; {nearest(name, list(self.views))}")
         return self.views[name]
 
-    def _argument(self, bound: Bound, name: str, kind: Any, given: Mapping[str, Any], own: Mapping[str, str]) -> str:
+    def _argument(self, bound: Bound, name: str, kind: Any, supplied: Mapping[str, Any], own: Mapping[str, str]) -> str:
         place, term = bound.place, bound.term
         if name in own:
             return own[name]
@@ -287,18 +289,18 @@ class Binder:
             first, self.lasting = self.lasting, self.lasting + term.lasting
             return str(first)
         if name == "command":
-            return str(self._command(bound, given.get("command")))
+            return str(self._command(bound, supplied.get("command")))
         if is_struct(kind):
-            return self._struct(bound, name, kind, given)
+            return self._struct(bound, name, kind, supplied)
         if kind not in WIDTHS:
             raise ValueError(f"{place}: {term.function_name} has a parameter {name}, which there is nothing for here")
         if name in ("stream", "value", "choice", "terminated", "joint", "body", "site", "index", "action"):
             raise ValueError(f"{place}: {term.function_name} has a parameter {name}, which there is nothing for here")
-        if name not in given:
+        if name not in supplied:
             raise ValueError(f"{place}: {term.function_name} needs {name}={shown_type(kind)}")
         # the divisor of a scan's columns is part of the kernel's bounds
-        check = stays(given[name]) if name == needs_of(term.function).points else None
-        first = self.numbers.add(f"{place}.{name}", given[name], WIDTHS[kind], check)
+        check = stays(supplied[name]) if name == needs_of(term.function).points else None
+        first = self.numbers.add(f"{place}.{name}", supplied[name], WIDTHS[kind], check)
         return EXPRESSIONS[kind].format(*range(first, first + WIDTHS[kind]))
 
     def reserve_command(self, name: str, term: Command) -> None:
@@ -345,14 +347,14 @@ class Binder:
                 f"{bound.place}: {bound.term.function_name} needs a command of {expected}; {command} has {found}"
             )
 
-    def _struct(self, bound: Bound, name: str, kind: Any, given: Mapping[str, Any]) -> str:
+    def _struct(self, bound: Bound, name: str, kind: Any, supplied: Mapping[str, Any]) -> str:
         place = bound.place
         if kind in STRUCTS:
             variable = STRUCTS[kind]
         elif is_robot(kind):
             assert bound.signature is not None
             robots = [key for key, each in bound.signature.parameters.items() if is_robot(each)]
-            robot = given.get(name, bound.term.robot if name == robots[0] else None)
+            robot = supplied.get(name, bound.term.robot if name == robots[0] else None)
             if robot is None:
                 raise ValueError(f"{place}: say which robot or object {name} is, with {name}=")
             self._view(place, robot)
@@ -362,7 +364,7 @@ class Binder:
                 raise ValueError(f"{place}: {bound.term.function_name} needs a terrain, and the task stands on none")
             variable = "terrain"
         else:
-            variable = f"sensor_{self._sensor(place, name, kind, given.get(name))}"
+            variable = f"sensor_{self._sensor(place, name, kind, supplied.get(name))}"
         self.structs[variable] = kind
         return variable
 
@@ -372,8 +374,8 @@ class Binder:
         if name is None and len(fitting) == 1:
             return fitting[0]
         if name not in self.sensors:
-            there = f"there are {', '.join(fitting)}" if fitting else "the task declares none"
-            raise ValueError(f"{place}: {parameter}= names a sensor that gives {shown_type(kind)}; {there}")
+            hint = f"there are {', '.join(fitting)}" if fitting else "the task declares none"
+            raise ValueError(f"{place}: {parameter}= names a sensor that gives {shown_type(kind)}; {hint}")
         if name not in fitting:
             gives = shown_type(self.sensors[name].arrays_type)
             raise ValueError(f"{place}: the sensor {name} gives {gives}, and {parameter} takes {shown_type(kind)}")
@@ -400,10 +402,10 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
         return found, [view.site_names[each] for each in found]
 
 
-def _function_instead(given: Any) -> str:
+def _function_instead(supplied: Any) -> str:
     """What a term takes instead of a value that is no function; for the name of a function, that function."""
     known = [f"terms.{name}" for name in dir(terms) if is_warp(getattr(terms, name))]
-    meant = f"terms.{given.removeprefix('terms.')}" if isinstance(given, str) else ""
+    meant = f"terms.{supplied.removeprefix('terms.')}" if isinstance(supplied, str) else ""
     anything = "a term is a @wp.func, or a Python function of the task that gives a tensor"
     return nearest(meant, known, anything, cutoff=0.8)
 

@@ -33,10 +33,10 @@ def cameras(
     known = [name for name, sensor in sensors.items() if hasattr(sensor, "channels")]
     for group, image in declaration.images.items():
         if image.sensor not in known:
-            there = nearest(image.sensor, known) if known else "the task declares none; give it a CameraSensor"
+            hint = nearest(image.sensor, known) if known else "the task declares none; give it a CameraSensor"
             no_camera = f"the sensor {image.sensor} is no camera"
             what = no_camera if image.sensor in sensors else f"there is no camera {image.sensor!r}"
-            raise ValueError(f"observations.{group}: {what}; {there}")
+            raise ValueError(f"observations.{group}: {what}; {hint}")
     for name in known:
         with placed(f"sensors.{name}"):
             sensors[name].rows(views)
@@ -46,7 +46,7 @@ def cameras(
 def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
     """Refuse image groups that the configuration does not declare: submission checks jobs against it."""
     groups, kind = config.observation_groups, type(config).__name__
-    there = [*declaration.groups, *declaration.images]
+    existing = [*declaration.groups, *declaration.images]
     for group in declaration.images:
         if not groups.get(group, False):
             raise ValueError(
@@ -54,9 +54,9 @@ def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
                 f'further_groups: ClassVar = {{"{group}": True}}'
             )
     for group, is_image in config.further_groups.items():
-        if group not in there:
+        if group not in existing:
             raise ValueError(
-                f"observations: {kind}.further_groups has {group}, and the task declares no such group; {nearest(group, there)}"
+                f"observations: {kind}.further_groups has {group}, and the task declares no such group; {nearest(group, existing)}"
             )
         if is_image and group not in declaration.images:
             raise ValueError(

@@ -142,8 +142,8 @@ def flat(place: str, value: Any, count: int) -> list[float]:
     """
     found = [value] if isinstance(value, int | float) else list(value) if _is_sequence(value) else None
     if found is None or len(found) != count or not all(isinstance(each, int | float) for each in found):
-        wanted = "a number" if count == 1 else f"{count} numbers"
-        raise ValueError(f"{place}: expected {wanted}, found {shown(value)}")
+        expected = "a number" if count == 1 else f"{count} numbers"
+        raise ValueError(f"{place}: expected {expected}, found {shown(value)}")
     numbers = [float(each) for each in found]
     if any(math.isnan(each) for each in numbers):
         raise ValueError(f"{place}: a number can't be NaN")

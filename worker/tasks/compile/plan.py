@@ -323,15 +323,15 @@ class KernelPlan:
 
         Terms come in the order of the settings that name them, then in that of the declaration.
         """
-        given, declared = config.rewards, self.declaration.rewards
-        for name in given:
+        supplied, declared = config.rewards, self.declaration.rewards
+        for name in supplied:
             if name not in declared:
                 near = nearest(name, declared) if declared else "it declares none"
                 raise ValueError(f"config.rewards.{name}: the task has no term {shown(name)}; {near}")
         if not declared:
             raise ValueError("rewards: there is none; declare one, such as Reward(terms.alive, weight=1.0)")
         names = [*config.default_weights, *(name for name in declared if name not in config.default_weights)]
-        found = {name: given.get(name, declared[name].weight) for name in names}
+        found = {name: supplied.get(name, declared[name].weight) for name in names}
         for name, weight in found.items():
             if weight is None:
                 raise ValueError(f"rewards.{name}: it has no weight; give it one, such as Reward(…, weight=-1.0)")

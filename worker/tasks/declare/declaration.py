@@ -220,9 +220,9 @@ class Observation(Term):
     ) -> None:
         super().__init__(function, **options)
         self.scale, self.offset = scale, offset
-        given: Any = noise if isinstance(noise, tuple | list) and len(noise) == 2 else ("uniform", noise)
-        self.noise_kind: str = given[0]
-        self.noise: float = given[1]
+        pair: Any = noise if isinstance(noise, tuple | list) and len(noise) == 2 else ("uniform", noise)
+        self.noise_kind: str = pair[0]
+        self.noise: float = pair[1]
         self.clip = clip
         self.delay = (0, delay) if isinstance(delay, int) else delay
         self.history = history
@@ -353,12 +353,12 @@ class Declaration:
                     f"sensors.{name}: expected a sensor, such as ContactSensor(...), found {a_type(sensor)}"
                 )
         if "policy" not in self.groups:
-            there = ", ".join(self.observations)
+            existing = ", ".join(self.observations)
             if "policy" in self.images:
                 raise ValueError(
-                    f"observations: the policy sees an image alone; give a group critic of terms besides (there are: {there})"
+                    f"observations: the policy sees an image alone; give a group critic of terms besides (there are: {existing})"
                 )
-            raise ValueError(f"observations: there is no group policy, only {there}")
+            raise ValueError(f"observations: there is no group policy, only {existing}")
 
     @property
     def by_group(self) -> Mapping[str, Mapping[str, Observation] | Image]:

@@ -81,9 +81,9 @@ def find_task(name: str) -> type[Task]:
 
     if not (isinstance(found, type) and issubclass(found, Task)):
         classes = [each for each in vars(module).values() if isinstance(each, type) and each.__module__ == module_name]
-        there = nearest(class_name, [each.__name__ for each in classes if issubclass(each, Task)])
+        hint = nearest(class_name, [each.__name__ for each in classes if issubclass(each, Task)])
         raise ValueError(
-            f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.run.task.Task; {there}"
+            f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.run.task.Task; {hint}"
         )
     if found.changes and module_name == found.__module__:  # by with_, which knows no name
         found.__name__ = found.__qualname__ = class_name

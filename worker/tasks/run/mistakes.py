@@ -97,9 +97,12 @@ def _parsed(text: str, package: str) -> tuple[str, str] | None:
     users = [found for found in _PARSED.finditer(text) if _is_users(found["file"], package)]
     if not users:
         return None
-    source, _, said = text[users[-1].end() :].partition("\n;")
-    said = " ".join((said or source).removeprefix("Error, ").split())
-    return f"{_shown(users[-1]['file'])}:{users[-1]['line']}", f"{said} (in `{source.strip()}`)" if source else said
+    source, _, message = text[users[-1].end() :].partition("\n;")
+    message = " ".join((message or source).removeprefix("Error, ").split())
+    return (
+        f"{_shown(users[-1]['file'])}:{users[-1]['line']}",
+        f"{message} (in `{source.strip()}`)" if source else message,
+    )
 
 
 def _hint(error: Exception, frame: FrameType) -> str:

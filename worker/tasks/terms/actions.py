@@ -62,7 +62,7 @@ def move_frame(world: int, ik: IkArrays, index: int, value: float):
     mjlab: DifferentialIKAction (which solves in every physics step, and takes quaternions wxyz). Isaac Lab:
     DifferentialInverseKinematicsAction (which solves in every physics step, and takes quaternions wxyz).
     """
-    ik.wanted[world, index] = value
+    ik.target[world, index] = value
 
 
 @wp.func

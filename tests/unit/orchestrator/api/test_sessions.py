@@ -20,7 +20,7 @@ def keys(tmp_path: Path) -> KeyStore:
     return key_store(tmp_path)
 
 
-def given(keys: KeyStore, name: str) -> str:
+def supplied(keys: KeyStore, name: str) -> str:
     key = next(each for each in keys.current().values() if each.name == name)
     return f"{key.access_key_id}:{key.secret}"
 
@@ -28,7 +28,7 @@ def given(keys: KeyStore, name: str) -> str:
 def test_a_session_has_the_rights_of_its_key_as_they_are_now(keys: KeyStore) -> None:
     keys.create("a", ("robots",), read_only=True)
     here = Access(keys, console_secret=SECRET)
-    session = here.sign_in(given(keys, "a"))
+    session = here.sign_in(supplied(keys, "a"))
     assert here.session(session) == Actor("key a", frozenset({"robots"}), True, "a")
     keys.delete("a")
     keys.create("a")
@@ -52,9 +52,9 @@ def test_a_changed_session_is_none(keys: KeyStore) -> None:
     keys.create("a")
     keys.create("b")
     here = Access(keys, console_secret=SECRET)
-    session = here.sign_in(given(keys, "a"))
+    session = here.sign_in(supplied(keys, "a"))
     name, end, rest = session.split(".", 2)
-    other = given(keys, "b").partition(":")[0]
+    other = supplied(keys, "b").partition(":")[0]
     changed = [f"{other}.{end}.{rest}", f"{name}.{int(end) + 1}.{rest}", session[:-1], session + "0"]
     changed += ["", ".", "...", "ä.1.x.y"]
     assert [here.session(each) for each in changed] == [None] * len(changed)
@@ -76,7 +76,7 @@ def test_a_session_ends_after_half_a_day_and_at_the_logout(keys: KeyStore, monke
     monkeypatch.setattr(access.time, "time", lambda: now)
     keys.create("a")
     here = Access(keys, console_secret=SECRET)
-    session, other = here.sign_in(given(keys, "a")), here.sign_in(given(keys, "a"))
+    session, other = here.sign_in(supplied(keys, "a")), here.sign_in(supplied(keys, "a"))
     here.sign_out(session)
     assert here.session(session) is None and here.session(other) is not None
     now += access.SESSION - 1
@@ -86,5 +86,5 @@ def test_a_session_ends_after_half_a_day_and_at_the_logout(keys: KeyStore, monke
 
 
 def test_forms_of_two_sessions_and_of_two_servers_have_different_tokens() -> None:
-    here, there = Access(console_secret=SECRET), Access()
-    assert len({here.form_token(""), here.form_token("a"), there.form_token(""), there.form_token("a")}) == 4
+    here, existing = Access(console_secret=SECRET), Access()
+    assert len({here.form_token(""), here.form_token("a"), existing.form_token(""), existing.form_token("a")}) == 4

@@ -88,7 +88,7 @@ def header(sent: Sent, name: str) -> str:
 def answer_to(sent: Sent, store: KeyStore) -> str:
     """``ACCEPTED`` where the application sees the request with its body, else the name of the error."""
     seen: list[bytes] = []
-    told: list[str] = []
+    reported: list[str] = []
 
     async def application(scope: Scope, receive: Receive, send: Send) -> None:
         seen.append((await receive())["body"])
@@ -97,7 +97,7 @@ def answer_to(sent: Sent, store: KeyStore) -> str:
         return {"type": "http.request", "body": sent.body, "more_body": False}
 
     async def send(message: Message) -> None:
-        told.extend(value.decode() for name, value in message.get("headers", ()) if name == b"x-amzn-errortype")
+        reported.extend(value.decode() for name, value in message.get("headers", ()) if name == b"x-amzn-errortype")
 
     scope = {
         "type": "http",
@@ -110,9 +110,9 @@ def answer_to(sent: Sent, store: KeyStore) -> str:
     }
     guard = Guard(application, Access(store), RateLimit(0))  # a new one each time: no failure is one too many
     asyncio.run(guard(scope, receive, send))
-    if told:
+    if reported:
         assert not seen
-        return told[0]
+        return reported[0]
     assert seen == [sent.body]
     return ACCEPTED
 
@@ -158,10 +158,10 @@ places = st.tuples(st.sampled_from(["batch", "logs"]), st.sampled_from(["us-east
 @st.composite
 def requests(draw: st.DrawFn) -> Sent:
     method, body = draw(st.sampled_from(["GET", "POST", "PUT", "DELETE"])), draw(st.binary(max_size=40))
-    given_headers = draw(headers)
+    supplied_headers = draw(headers)
     if draw(st.booleans()):
-        given_headers.append(("x-amz-content-sha256", sha256(body).hexdigest()))
-    return Sent(method, draw(paths), draw(queries), tuple(given_headers), body)
+        supplied_headers.append(("x-amz-content-sha256", sha256(body).hexdigest()))
+    return Sent(method, draw(paths), draw(queries), tuple(supplied_headers), body)
 
 
 @settings(max_examples=200)

@@ -67,10 +67,10 @@ def policy(path: Path, matrix: list[list[float]], note: str = "") -> Path:
     """An ONNX file of one product with ``matrix`` and a bias of two numbers."""
     weights = np.array(matrix, np.float32)
     arrays = [numpy_helper.from_array(weights, "w"), numpy_helper.from_array(np.array([0.5, 0.5], np.float32), "b")]
-    given = helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", len(matrix)])
+    supplied = helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["n", len(matrix)])
     made = helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["n", 2])
     graph = helper.make_graph(
-        [helper.make_node("Gemm", ["obs", "w", "b"], ["actions"])], "policy", [given], [made], arrays
+        [helper.make_node("Gemm", ["obs", "w", "b"], ["actions"])], "policy", [supplied], [made], arrays
     )
     onnx.save(helper.make_model(graph, doc_string=note), path)
     return path

@@ -19,8 +19,8 @@ RECORD = {"iteration": 3, "reward": 1.0, "time": 1.0, "warnings": ["it unlearns:
 
 
 def running(phase: str | None, attempts: int = 1) -> dict[str, Any]:
-    there = [{"epoch": 1, "nodes": [{}]}] * attempts
-    return {"status": "RUNNING", "statusReason": "attempt 1 runs on 1 node", "phase": phase, "attempts": there}
+    existing = [{"epoch": 1, "nodes": [{}]}] * attempts
+    return {"status": "RUNNING", "statusReason": "attempt 1 runs on 1 node", "phase": phase, "attempts": existing}
 
 
 def test_a_warning_names_the_run(capsys: pytest.CaptureFixture[str]) -> None:

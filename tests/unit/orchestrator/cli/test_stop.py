@@ -9,7 +9,7 @@ from orchestrator.cli.jobs import lost_iterations, next_step, slow_iteration
 
 def training(done: int, saved: int, seconds: float = 1.0, **facts: Any) -> dict[str, Any]:
     progress = {"iteration": done, "iteration_seconds": seconds} if done else None
-    told = {
+    reported = {
         "name": "ant",
         "kind": "train",
         "status": "RUNNING",
@@ -17,7 +17,7 @@ def training(done: int, saved: int, seconds: float = 1.0, **facts: Any) -> dict[
         "results": {"iteration": saved},
         "children": None,
     }
-    return {**told, **facts}
+    return {**reported, **facts}
 
 
 def test_iterations_that_no_checkpoint_has_are_lost_and_a_long_one_is_told_before_it_is_left() -> None:
@@ -27,8 +27,8 @@ def test_iterations_that_no_checkpoint_has_are_lost_and_a_long_one_is_told_befor
     assert lost_iterations(training(3, 0, kind="command", progress=None, results=None)) == ""
     assert slow_iteration(training(7, 7, seconds=1.0)) == slow_iteration(training(0, 0)) == ""
     assert slow_iteration(training(7, 7, seconds=40.0, status="RUNNABLE")) == ""
-    told = slow_iteration(training(7, 7, seconds=40.0))
-    assert told.startswith("an iteration takes about 40 s; ") and "muster checkpoint ant, then stop" in told
+    reported = slow_iteration(training(7, 7, seconds=40.0))
+    assert reported.startswith("an iteration takes about 40 s; ") and "muster checkpoint ant, then stop" in reported
 
 
 def test_a_job_that_is_over_says_what_can_follow() -> None:

@@ -22,11 +22,11 @@ def test_the_wizard_of_every_task_begins_with_a_job_that_can_be_submitted() -> N
 
 
 def test_settings_of_an_algorithm_that_is_not_chosen_are_left_out() -> None:
-    def given(group: FieldGroup) -> FieldGroup:
+    def supplied(group: FieldGroup) -> FieldGroup:
         values = {"train.algorithm": "sac", "train.ppo.gamma": "0.9", "train.sac.gamma": "0.8"}
         return replace(group, fields=tuple(replace(each, value=values.get(each.name, "")) for each in group.fields))
 
-    train = document("Ant", [given(each) for each in groups("Ant", [])])["train"]
+    train = document("Ant", [supplied(each) for each in groups("Ant", [])])["train"]
     assert train == {"task": "Ant", "algorithm": "sac", "sac": {"gamma": 0.8}}
 
 

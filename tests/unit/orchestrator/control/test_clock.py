@@ -38,7 +38,7 @@ class Machine:
         return Clock(lambda: self.wall, lambda: self.monotonic, lambda: self.boot)
 
 
-def begun(machine: Machine, database: Database) -> Clock:
+def started(machine: Machine, database: Database) -> Clock:
     clock = machine.clock()
     with database.session() as session:
         clock.restore(session)
@@ -56,7 +56,7 @@ def test_steady_time_begins_as_the_wall_clock_and_passes_over_its_steps_and_the_
     database: Database,
 ) -> None:
     machine = Machine()
-    clock = begun(machine, database)
+    clock = started(machine, database)
     start = clock.now()
     assert start == machine.wall * 1000 and clock.drift == 0 and not clock.stepped
     machine.passes(10)
@@ -67,22 +67,22 @@ def test_steady_time_begins_as_the_wall_clock_and_passes_over_its_steps_and_the_
         assert clock.now() == start + 10_000
     assert clock.drift == -21 * HOUR * 1000
     machine.passes(5)
-    again = begun(machine, database)
+    again = started(machine, database)
     assert (again.now(), again.drift) == (start + 15_000, clock.drift), "the next controller goes on from there"
     machine.wall += HOUR
     machine.passes(1)
-    noted(begun(machine, database), database)  # while no controller ran
+    noted(started(machine, database), database)  # while no controller ran
 
 
 def test_after_another_boot_the_wall_clock_says_how_much_time_has_passed(database: Database) -> None:
     machine = Machine()
-    clock = begun(machine, database)
+    clock = started(machine, database)
     start = clock.now()
     machine.wall += 2 * HOUR
     noted(clock, database)
     machine.passes(10)
     machine.wall, machine.monotonic, machine.boot = machine.wall + 60, 3.0, "second"
-    after = begun(machine, database)
+    after = started(machine, database)
     assert (after.now(), after.drift) == (start + 70_000, clock.drift) and not after.stepped
 
 

@@ -110,10 +110,10 @@ def test_a_gang_that_ends_costs_looks_at_no_other(
     bench: tuple[FakeController[FakeEngine], Costs], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     controller, costs = bench
-    advance, looked = Attempts.advance, set[str]()
+    advance, polled = Attempts.advance, set[str]()
 
     def noted(self: Attempts, session: Any, job: Any, attempt: Any) -> Any:
-        looked.add(job.id)
+        polled.add(job.id)
         return advance(self, session, job, attempt)
 
     monkeypatch.setattr(Attempts, "advance", noted)
@@ -123,7 +123,7 @@ def test_a_gang_that_ends_costs_looks_at_no_other(
         controller.ticks(lambda: controller.database.counts.by_status().get(Status.SUCCEEDED) == 1)
 
     costs.watched(passes)
-    assert looked == {"job-3"}
+    assert polled == {"job-3"}
     assert not [each for each in costs.statements if "SELECT" in each and "IN (?, ?" in each]
     assert costs.files == []
 

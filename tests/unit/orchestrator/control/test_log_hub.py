@@ -34,8 +34,8 @@ class World:
 
     def __init__(self, directory: Path) -> None:
         self.database = Database.at(directory)
-        self.asked = Counter[tuple[str, int]]()
-        self.bus = SimpleNamespace(ask_for_logs=lambda job, attempt: self.asked.update([(job, attempt)]))
+        self.requested = Counter[tuple[str, int]]()
+        self.bus = SimpleNamespace(ask_for_logs=lambda job, attempt: self.requested.update([(job, attempt)]))
         self.problem: str | None = None
         self.calls = StoreCalls(directory, lambda: self.problem)
         self.hub = LogHub(self.database, self.bus, self.calls)  # type: ignore[arg-type]
@@ -92,16 +92,16 @@ class World:
         self.threads[-1].start()
         return pieces
 
-    def heard(self) -> None:
+    def received(self) -> None:
         """Until the hub takes what nodes tell, which they do then."""
-        wait_for(lambda: self.hub._followed and self.hub._followed["job"].logs._has_looked, what="the first look")
+        wait_for(lambda: self.hub._followed and self.hub._followed["job"].logs._has_polled, what="the first look")
         self.state(max(number for number, _ in self.writers))
         wait_for(self.is_quiet, what="that nobody looks at files")
 
     def is_quiet(self) -> bool:
         """Whether all nodes push, and no look at the files is under way."""
         job = self.hub._followed["job"]
-        return job.logs.delivers() and not job.is_looked_at
+        return job.logs.delivers() and not job.is_polled
 
     def close(self) -> None:
         self.closing.set()
@@ -132,9 +132,9 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     genuine = read_log
 
     def counted(name: str) -> Callable[..., Chunk]:
-        def read(*given: Any) -> Chunk:
+        def read(*supplied: Any) -> Chunk:
             found[name] += 1
-            return genuine(*given)
+            return genuine(*supplied)
 
         return read
 
@@ -149,8 +149,8 @@ def test_nodes_are_asked_to_push_and_a_line_reaches_all_followers_without_a_file
     everyone = [world.follow() for _ in range(20)]
     world.write("before", push=False)
     wait_for(lambda: all(has(each, "before") for each in everyone))
-    wait_for(lambda: world.asked["job", 1])
-    world.heard()
+    wait_for(lambda: world.requested["job", 1])
+    world.received()
     looks.clear()
     for number in range(50):
         world.write(f"line {number}", (1, number % 2))
@@ -160,7 +160,7 @@ def test_nodes_are_asked_to_push_and_a_line_reaches_all_followers_without_a_file
 
 def test_a_lost_push_costs_one_look_for_all_followers(world: World, looks: Counter[str]) -> None:
     everyone = [world.follow() for _ in range(20)]
-    world.heard()
+    world.received()
     world.write("first")
     wait_for(lambda: all(has(each, "first") for each in everyone))
     looks.clear()
@@ -183,16 +183,16 @@ def test_a_supervisor_that_knows_no_pushes_any_more_is_read_and_asked_again(
     monkeypatch.setattr(log_hub, "_ASK", 0.05)
     monkeypatch.setattr(log_hub, "_ASK_SELDOM", 0.1)
     pieces = world.follow()
-    world.heard()
-    asked = world.asked["job", 1]
+    world.received()
+    requested = world.requested["job", 1]
     world.bus.stated(("job", 1, 0), None, False)
     world.write("of the successor", push=False)
-    wait_for(lambda: has(pieces, "of the successor") and world.asked["job", 1] > asked)
+    wait_for(lambda: has(pieces, "of the successor") and world.requested["job", 1] > requested)
 
 
 def test_followers_end_with_the_job_and_have_its_last_line_though_its_push_was_lost(world: World) -> None:
     everyone = [world.follow() for _ in range(5)]
-    world.heard()
+    world.received()
     world.write("seen")
     wait_for(lambda: all(has(each, "seen") for each in everyone))
     world.write("the very last", push=False)
@@ -207,7 +207,7 @@ def test_followers_end_with_the_job_and_have_its_last_line_though_its_push_was_l
 def test_followers_end_though_no_commit_told_of_the_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_hub, "_ROWS", 0.0)
     pieces = world.follow()
-    world.heard()
+    world.received()
     world.write("seen")
     wait_for(lambda: has(pieces, "seen"))
     world.database.committed = None
@@ -227,22 +227,22 @@ def test_the_follower_of_a_job_that_is_over_or_gone_ends(world: World) -> None:
 
 def test_a_new_attempt_is_taken_up_and_asked_and_the_end_of_the_former_is_not_lost(world: World) -> None:
     pieces = world.follow()
-    world.heard()
+    world.received()
     world.write("first attempt")
     wait_for(lambda: has(pieces, "first attempt"))
     world.write("its end", push=False)
     world.end(1)
     world.begin(2)
     world.write("second attempt", (2, 1), push=False)
-    wait_for(lambda: has(pieces, "first attempt", "its end", "second attempt") and world.asked["job", 2])
-    world.heard()
+    wait_for(lambda: has(pieces, "first attempt", "its end", "second attempt") and world.requested["job", 2])
+    world.received()
     world.write("pushed", (2, 0))
     wait_for(lambda: has(pieces, "pushed"))
 
 
 def test_while_the_store_is_away_lines_come_from_memory_and_nothing_is_lost(world: World) -> None:
     pieces = world.follow()
-    world.heard()
+    world.received()
     world.write("before")
     wait_for(lambda: has(pieces, "before"))
     world.problem = "there is no store"
@@ -272,7 +272,7 @@ def test_a_follower_that_takes_nothing_holds_no_other_up_and_keeps_little(world:
     waker = Waker()
     with world.hub.follow(world.run, "job", waker) as logs:  # it never reads
         pieces = world.follow()
-        world.heard()
+        world.received()
         for number in range(400):
             world.write(f"{number} " + "x" * 5000)
         world.state()
@@ -285,7 +285,7 @@ def test_all_followed_logs_share_a_bounded_memory(world: World, monkeypatch: pyt
     bound = 1 << 20
     monkeypatch.setattr(log_hub, "_MEMORY", bound)
     with world.hub.follow(world.run, "job", Waker()) as logs:
-        world.heard()
+        world.received()
         for node in range(40):
             for position in range(0, 1 << 18, 1 << 14):
                 world.bus.pushed(("job", 1, node), position, b"x" * (1 << 14))
@@ -318,7 +318,7 @@ def test_looks_become_rare_while_they_find_nothing_and_frequent_again_with_a_cha
         for _ in range(round(seconds / 0.05)):
             clock += 0.05001
             world.hub._round([job])
-            wait_for(lambda: not job.is_looked_at)
+            wait_for(lambda: not job.is_polled)
         return looks - before
 
     assert looks_in(2.0) >= 20, "after a tenth of the silence"
@@ -343,7 +343,7 @@ def test_what_happens_during_a_look_has_the_next_one_come_soon(world: World, mon
 
     monkeypatch.setattr(job.logs, "look", look)
     world.hub._look(job)
-    wait_for(lambda: not job.is_looked_at)
+    wait_for(lambda: not job.is_polled)
     assert job.pause == log_hub._LOOK
 
 

@@ -19,7 +19,7 @@ from shared_store.volume.node_outcomes import Outcome
 from tests.support.orchestrator.rows import job
 from tests.support.orchestrator.slow_pool import SlowPool
 
-AWAY = NodeStatus(NodePhase.UNREACHABLE, words="the engine is away")
+ABSENT = NodeStatus(NodePhase.UNREACHABLE, words="the engine is away")
 
 
 class Gang:
@@ -55,7 +55,7 @@ class Gang:
 @pytest.mark.parametrize("end", [ended("", None), NodeStatus(NodePhase.ENDED, cause=Cause.EXIT, exit_code=0)])
 def test_an_outcome_that_was_not_there_before_the_node_ended_is_looked_for_again(end: NodeStatus) -> None:
     gang = Gang()
-    assert isinstance(gang.look(AWAY, AWAY), Observed), "what can't be seen is looked for, and not waited for"
+    assert isinstance(gang.look(ABSENT, ABSENT), Observed), "what can't be seen is looked for, and not waited for"
     gang.pool.carry_out()  # it finds nothing
     gang.write(0, 0)
     running: GangStatus = [end, NodeStatus(NodePhase.RUNNING)]
@@ -79,7 +79,7 @@ def test_outcomes_of_nodes_that_an_earlier_controller_met_are_looked_for_only_wh
     assert not gang.observer.has_hidden(("job", 1))
 
 
-@pytest.mark.parametrize("hidden", [AWAY, NodeStatus(NodePhase.RUNNING, stale="slurmctld is away")])
+@pytest.mark.parametrize("hidden", [ABSENT, NodeStatus(NodePhase.RUNNING, stale="slurmctld is away")])
 def test_a_node_that_its_engine_can_t_see_is_looked_for_again_soon_also_without_a_bus(hidden: NodeStatus) -> None:
     gang = Gang(None)
     gang.look(hidden, NodeStatus(NodePhase.RUNNING))
@@ -93,7 +93,7 @@ def test_a_node_that_its_engine_can_t_see_is_looked_for_again_soon_also_without_
 
 def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_without_an_outcome() -> None:
     gang = Gang()
-    gang.look(AWAY, AWAY)
+    gang.look(ABSENT, ABSENT)
     body, future = gang.pool.calls.pop()
     found = body()  # by now it has read that there is none
     gang.write(0, 0)

@@ -261,14 +261,14 @@ def test_a_controller_that_ends_amid_a_step_leaves_the_rows_to_the_next_one(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world.ended("old")
-    ending, throw = world.retention(), trash.throw_away
+    ending, throw = world.retention(), trash.discard
 
     def late(store: Store, paths: Iterable[Path]) -> list[Path]:
         ending._is_closing.set()
         return throw(store, paths)
 
     with monkeypatch.context() as patched:
-        patched.setattr(trash, "throw_away", late)
+        patched.setattr(trash, "discard", late)
         ending._pass()
     ending.close()
     assert world.jobs() == ["old"] and world.runs() == [] and len(world.trashed()) == 1

@@ -17,10 +17,10 @@ from tests.support.permissions import permissions_count
 def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
     world.ended("old")
 
-    def away() -> None:
+    def absent() -> None:
         raise OSError("the volume is not there")
 
-    world.access.check = away
+    world.access.check = absent
     with pytest.raises(OSError):
         world.retention().take_all()
     assert world.jobs() == ["old"] and world.runs() == ["old"]

@@ -63,27 +63,27 @@ def test_a_job_that_begins_to_wait_for_one_that_is_being_taken_keeps_its_row(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     world.ended("old")
-    throw = trash.throw_away
+    throw = trash.discard
 
     def late(store: Store, paths: Iterable[Path]) -> list[Path]:
         world.add(job("waits", status="PENDING"), Dependency(job_id="waits", on_id="old"))
         return throw(store, paths)
 
-    monkeypatch.setattr(trash, "throw_away", late)
+    monkeypatch.setattr(trash, "discard", late)
     world.retention().take_all()
     assert world.jobs() == ["old", "waits"]
 
 
 def at_the_last_moment(monkeypatch: pytest.MonkeyPatch, body: Callable[[], object]) -> None:
     """Do this after everything was looked at, and before the first directory is moved."""
-    throw, calls = trash.throw_away, [body]
+    throw, calls = trash.discard, [body]
 
     def late(store: Store, paths: Iterable[Path]) -> list[Path]:
         if calls:
             calls.pop()()
         return throw(store, paths)
 
-    monkeypatch.setattr(trash, "throw_away", late)
+    monkeypatch.setattr(trash, "discard", late)
 
 
 CLAIM = Claim("another-controller", "theirs", 1)
@@ -162,11 +162,11 @@ def test_what_needs_runs_is_looked_for_again_before_a_run_that_was_cited_can_be_
     retention, taken = world.retention(), list[bool]()
     refresh = retention.stored.refresh
 
-    def looked() -> None:
+    def polled() -> None:
         taken.append(world.users.take("old"))
         refresh()
 
-    monkeypatch.setattr(retention.stored, "refresh", looked)
+    monkeypatch.setattr(retention.stored, "refresh", polled)
     controller: Any = SimpleNamespace(retention=retention, access=SimpleNamespace(users=world.users))
     with using(controller, "old"):
         assert not taken

@@ -48,7 +48,7 @@ def test_a_stop_waits_for_those_of_its_own_engine_alone_and_its_reason_says_so(m
         wait_for(lambda: requested.reason(("c", 1)), 2, "that it says so, once it has waited for a while")
         assert [requested.reason((job, 1)) for job in ("a", "b", "d")] == [None] * 3
         waits = "attempt 1 waits for its turn to be stopped: the docker engine is stopping 2 others"
-        assert requested.reason(("c", 1)) == waits and requested.has_begun(("c", 1))
+        assert requested.reason(("c", 1)) == waits and requested.has_started(("c", 1))
         answers.set()
         wait_for(lambda: changed.count("c") == 2, 2, "that it has begun, and has returned")
         assert requested.reason(("c", 1)) == "attempt 1 is being stopped"

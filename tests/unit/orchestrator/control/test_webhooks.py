@@ -56,10 +56,10 @@ SHORT = "whsec_c2hvcnQ="
 )
 def test_a_mistake_is_told_in_one_line_without_a_secret(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     path = write_webhooks(tmp_path / "hooks.json", chat={"url": URL, **changes})
-    told = refusal(read_webhooks, path, error=WebhooksError)
-    assert words in told and told.startswith(f"{path}: ") and "\n" not in told
+    reported = refusal(read_webhooks, path, error=WebhooksError)
+    assert words in reported and reported.startswith(f"{path}: ") and "\n" not in reported
     for secret in (SECRET, SHORT, SECRET.removeprefix("whsec_")):
-        assert secret not in told
+        assert secret not in reported
 
 
 def test_a_missing_or_publicly_readable_file_is_refused(tmp_path: Path) -> None:
@@ -106,7 +106,7 @@ def test_an_evaluation_tells_of_itself_and_a_training_of_its_newest_checkpoint(t
     write_json(run.evaluations / "00000003-e1-1f2e3d4c.json", {**figures, "mean_return": 3.0})
     write_json(run.evaluations / "00000006-e1.json", {**figures, "mean_return": 6.0})
 
-    def told(job_id: str, spec: dict[str, object]) -> tuple[str | None, float | None]:
+    def reported(job_id: str, spec: dict[str, object]) -> tuple[str | None, float | None]:
         environment = [{"name": "MUSTER_SPEC", "value": json.dumps(spec)}]
         ranges = [{"targetNodes": "0:", "container": {"environment": environment}}]
         properties = {"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges}
@@ -115,6 +115,6 @@ def test_an_evaluation_tells_of_itself_and_a_training_of_its_newest_checkpoint(t
         checkpoint, summary = _evaluated(run, about)
         return checkpoint, summary and summary["mean_return"]
 
-    assert told("1f2e3d4c-5b6a", {"evaluate": {"run": "taught"}}) == ("00000003-e1", 3.0)
-    assert told("99999999-5b6a", {"evaluate": {"run": "taught"}}) == (None, None), "it failed before it had one"
-    assert told("99999999-5b6a", {"train": {"task": "Cartpole"}}) == ("00000006-e1", 6.0)
+    assert reported("1f2e3d4c-5b6a", {"evaluate": {"run": "taught"}}) == ("00000003-e1", 3.0)
+    assert reported("99999999-5b6a", {"evaluate": {"run": "taught"}}) == (None, None), "it failed before it had one"
+    assert reported("99999999-5b6a", {"train": {"task": "Cartpole"}}) == ("00000006-e1", 6.0)

@@ -42,7 +42,7 @@ def test_a_gang_that_others_cancel_is_started_again_a_bounded_number_of_times(
 ) -> None:
     state = ENDING
     state = replace(state, terms=replace(TERMS, cancelled=before, allowed=allowed))
-    gone = Gone(T, (NodeEnd(75, "left on request", 1.0, asked=True),) * 2, SAVED, HOW, most)
+    gone = Gone(T, (NodeEnd(75, "left on request", 1.0, requested=True),) * 2, SAVED, HOW, most)
     (close,) = step(state, gone)
     assert close == do.Close(T, False, status, f"attempt 2 was {HOW}{SAVED}{words}", HOW)
 

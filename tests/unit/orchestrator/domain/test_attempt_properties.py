@@ -30,7 +30,7 @@ NODES = 2
 moments = st.integers(0, 200_000).map(lambda each: 10_000_000 + each)
 codes = st.sampled_from([0, 1, 75, 137, 143])
 node_ends = st.none() | st.builds(
-    NodeEnd, codes, st.just("why"), st.floats(0, 9), lost=st.booleans(), asked=st.booleans()
+    NodeEnd, codes, st.just("why"), st.floats(0, 9), lost=st.booleans(), requested=st.booleans()
 )
 both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NODES)
 silence = st.builds(Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "deaf"]))

@@ -67,7 +67,7 @@ def test_amounts_are_added_and_subtracted_kind_by_kind() -> None:
 
 
 @pytest.mark.parametrize(
-    ("asked", "free", "fits"),
+    ("requested", "free", "fits"),
     [
         (Resources(2, 1, 100), Resources(2, 1, 100), True),
         (Resources(2, 0, 100), Resources(4, 1, 200), True),
@@ -77,8 +77,8 @@ def test_amounts_are_added_and_subtracted_kind_by_kind() -> None:
         (Resources(0.1, 0, 1), Resources(0.3 - 0.1 - 0.1, 0, 1), True),  # less than 0.1, as floats round
     ],
 )
-def test_an_amount_fits_where_there_is_enough_of_every_kind(asked: Resources, free: Resources, fits: bool) -> None:
-    assert (asked <= free) is fits and (free >= asked) is fits
+def test_an_amount_fits_where_there_is_enough_of_every_kind(requested: Resources, free: Resources, fits: bool) -> None:
+    assert (requested <= free) is fits and (free >= requested) is fits
 
 
 @given(amounts, amounts)

@@ -38,7 +38,9 @@ def ends(*codes: tuple[float, ...] | int | None) -> list[NodeEnd | None]:
     """By node index: a code, its time and whether it was asked to end, or None for a node that runs."""
     reported = [each if isinstance(each, tuple) else (each,) for each in codes]
     return [
-        None if each[0] is None else NodeEnd(int(each[0]), f"exit {each[0]}", *each[1:2] or (1.0,), asked=len(each) > 2)
+        None
+        if each[0] is None
+        else NodeEnd(int(each[0]), f"exit {each[0]}", *each[1:2] or (1.0,), requested=len(each) > 2)
         for each in reported
     ]
 
@@ -157,7 +159,7 @@ def test_the_ends_of_nodes_are_judged(
     assert (verdict and (verdict.ending, verdict.reason, verdict.exit_code)) == expected
 
 
-ASKED = [
+REQUESTED = [
     # what was told to end is the cause only where nothing else is, in any order of reading, and whatever the clocks say
     ((RUNS, (143, 1.0, True)), "node 1: exit 143", False),
     ((RUNS, (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
@@ -171,7 +173,7 @@ ASKED = [
 ]
 
 
-@pytest.mark.parametrize(("codes", "reason", "certain"), ASKED)
+@pytest.mark.parametrize(("codes", "reason", "certain"), REQUESTED)
 def test_a_node_that_was_asked_to_end_is_not_the_cause(
     codes: tuple[tuple[float, ...] | int | None, ...], reason: str, certain: bool
 ) -> None:

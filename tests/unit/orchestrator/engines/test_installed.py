@@ -79,15 +79,15 @@ WRONG_TAGS = {
 @pytest.mark.parametrize("case", WRONG_TAGS)
 def test_a_tag_that_is_misspelt_or_of_a_wrong_kind_is_refused_with_the_nearest_name(case: str) -> None:
     tag, value, engine, *queue = case.split("|")
-    said = refusal(check_tags, {tag: value}, [engine], of_a_queue=bool(queue))
-    assert said == f"tag {tag}{WRONG_TAGS[case]}"
+    output = refusal(check_tags, {tag: value}, [engine], of_a_queue=bool(queue))
+    assert output == f"tag {tag}{WRONG_TAGS[case]}"
 
 
 @pytest.mark.parametrize("name", ["slurm", "aws-batch"])
 def test_every_option_is_in_the_documentation_of_its_engine(name: str) -> None:
     page = (DOCUMENTATION / "engines" / f"{name}.md").read_text()
-    told = re.findall(r"^\| `muster:([a-z-]+)`", page, re.M)
-    assert {option.name for option in engine_type(name).options} == {*told}
+    reported = re.findall(r"^\| `muster:([a-z-]+)`", page, re.M)
+    assert {option.name for option in engine_type(name).options} == {*reported}
 
 
 ROOT = Path(orchestrator.__file__).parent
@@ -176,8 +176,8 @@ def test_secrets_go_the_way_that_the_engine_declares(way: SecretValues, monkeypa
                 several.plan(gang)
         else:
             several.plan(gang)
-        given = several.with_secrets(gang).environments[0].get("KEY")
-        assert given == ("value" if way is SecretValues.ENVIRONMENT else None)
+        supplied = several.with_secrets(gang).environments[0].get("KEY")
+        assert supplied == ("value" if way is SecretValues.ENVIRONMENT else None)
         monkeypatch.undo()
         with nullcontext() if way is SecretValues.REFERENCES else pytest.raises(SecretsError):
             several.check_secrets(["fake"], [CONTAINER], "default")
@@ -200,7 +200,7 @@ def test_a_handle_is_read_as_it_was_written() -> None:
 
 
 @pytest.mark.parametrize(
-    ("engine", "told", "facts"),
+    ("engine", "reported", "facts"),
     [
         ("local", {"gang": "job/1/2", "nodes": [{"pid": 7, "start": "1", "address": "a b"}]}, {"nodes"}),
         ("docker", {"gang": "job/1/2", "job": "job", "addresses": ["10.192.0.2"]}, {"job", "addresses"}),
@@ -209,10 +209,10 @@ def test_a_handle_is_read_as_it_was_written() -> None:
         ("aws-batch", {"gang": "job/1/2", "aws": "0-1", "queue": "q"}, {"aws", "queue"}),
     ],
 )
-def test_a_handle_of_an_earlier_version_is_read(engine: str, told: dict[str, Any], facts: set[str]) -> None:
-    found = read_handle(f"{engine} 3 {json.dumps(told)}")
+def test_a_handle_of_an_earlier_version_is_read(engine: str, reported: dict[str, Any], facts: set[str]) -> None:
+    found = read_handle(f"{engine} 3 {json.dumps(reported)}")
     assert (found.engine, found.gang, found.nodes) == (engine, "job/1/2", 3)
-    assert found.facts == {name: told[name] for name in facts}
+    assert found.facts == {name: reported[name] for name in facts}
 
 
 @pytest.mark.parametrize("text", ["", "local", "local 3", "local x {}", "local 3 []", "{}", '{"engine": "local"}', "{"])

@@ -78,11 +78,19 @@ def test_docker_s_state_of_a_container_gives_the_cause_of_its_end(
 def test_a_report_of_ray_s_driver_becomes_the_node_s_phase(
     node: dict[str, Any], phase: str, why: str, seen: tuple[Any, ...]
 ) -> None:
-    told = {"running": True, "address": "10.0.0.1", "code": None, "detail": "", "started": True, "gpus": "0,1", **node}
-    status = ray_status(told, {"phase": phase, "why": why}, True)
+    reported = {
+        "running": True,
+        "address": "10.0.0.1",
+        "code": None,
+        "detail": "",
+        "started": True,
+        "gpus": "0,1",
+        **node,
+    }
+    status = ray_status(reported, {"phase": phase, "why": why}, True)
     assert (status.phase, status.cause, status.words) == seen and status.gpus == ("0", "1")
     if node.get("running", True):
-        orphan = ray_status(told, {"phase": phase, "why": why}, False)
+        orphan = ray_status(reported, {"phase": phase, "why": why}, False)
         assert (orphan.cause, orphan.words) == (Cause.HOST_LOST, "its driver died")
 
 
@@ -164,14 +172,14 @@ def test_a_node_without_an_outcome_is_lost_by_its_cause_and_not_by_its_words(
         end = seen_end(NodeStatus(ENDED, "", words, cause, code), True, 5.0)
         assert (end.lost, end.exit_code, end.ended) == (lost, code or 137, 5.0)
         assert end.cannot_start is (cause is Cause.CANNOT_START)
-        told = f"exit {code}, outcome not written{words and f' ({words})'}" if cause is Cause.EXIT else words
-        assert end.reason == (told or "the supervisor died without an outcome")
+        reported = f"exit {code}, outcome not written{words and f' ({words})'}" if cause is Cause.EXIT else words
+        assert end.reason == (reported or "the supervisor died without an outcome")
     preempted = seen_end(NodeStatus(ENDED, "", "preempted by Slurm", Cause.PREEMPTED, 75), False, 5.0)
     assert (preempted.lost, preempted.exit_code) == (True, 137), "a job of the Batch API has lost its host"
 
 
 @pytest.mark.parametrize(
-    ("cause", "asked", "is_told"),
+    ("cause", "requested", "is_reported"),
     [
         (Cause.EXIT, False, True),
         (None, False, True),
@@ -180,10 +188,10 @@ def test_a_node_without_an_outcome_is_lost_by_its_cause_and_not_by_its_words(
     ],
 )
 def test_the_fault_of_an_outcome_counts_unless_the_node_was_ended_from_outside(
-    cause: Cause | None, asked: bool, is_told: bool
+    cause: Cause | None, requested: bool, is_reported: bool
 ) -> None:
     error = FirstError(0, "ValueError: bad", "", 1.0, Fault("ValueError", "reward.py", 3))
-    outcome = Outcome(0, 1, 1, None, "rank 0 exited with code 1", error, 1.0, 2.0, asked)
+    outcome = Outcome(0, 1, 1, None, "rank 0 exited with code 1", error, 1.0, 2.0, requested)
     end, _ = node_end(outcome, NodeStatus(ENDED, cause=cause, exit_code=1), True, 3000)
-    assert end.fault == ("ValueError in reward.py, line 3" if is_told else None)
+    assert end.fault == ("ValueError in reward.py, line 3" if is_reported else None)
     assert node_end(Outcome(0, 1, 1, None, "why", None, 1.0, 2.0), NodeStatus(ENDED), True, 3000)[0].fault is None

@@ -52,9 +52,9 @@ def test_the_launcher_s_file_holds_ray_s_own_schema_and_muster_is_told_how_far_i
     types = config["available_node_types"]
     assert config["head_node_type"] in types
     text = " ".join(config["head_start_ray_commands"])
-    told = re.search(r"MUSTER_RAY_GROWS_TO='([^']+)'", text)
-    assert told
-    [shape] = grows_to(told[1])
+    reported = re.search(r"MUSTER_RAY_GROWS_TO='([^']+)'", text)
+    assert reported
+    [shape] = grows_to(reported[1])
     resources = types["gpu"]["resources"]
     found = (resources["CPU"], resources["GPU"], types["gpu"]["max_workers"])
     assert (shape["cpus"], shape["gpus"], shape["most"]) == found

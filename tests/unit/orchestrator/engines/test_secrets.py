@@ -55,9 +55,9 @@ def test_a_secret_of_some_queues_is_given_to_their_jobs_alone(file: Path) -> Non
     file.write_text(json.dumps({"token": kept, "broken": {"value": "abc", "queues": "robots"}}))  # read at each launch
     assert secrets.of(asking(f"{MANAGER}token:key::"), "robots") == {"PASSWORD": "abc"}
     for name, queue in (("token", "lab"), ("token", "robot"), ("broken", "robots")):
-        with pytest.raises(SecretsError, match=f"'{name}' is not for job queue {queue}; add the queue in") as said:
+        with pytest.raises(SecretsError, match=f"'{name}' is not for job queue {queue}; add the queue in") as output:
             secrets.check([asking(name)], queue)
-        assert "abc" not in str(said.value)
+        assert "abc" not in str(output.value)
 
 
 def test_variables_leave_the_controllers_environment() -> None:
@@ -77,8 +77,8 @@ def test_variables_leave_the_controllers_environment() -> None:
     ],
 )
 def test_a_missing_secret_is_named_without_a_value(file: Path, value_from: str, message: str) -> None:
-    said = refusal(Secrets(str(file)).of, asking(value_from), "default", error=SecretsError)
-    assert message in said and "hunter2" not in said
+    output = refusal(Secrets(str(file)).of, asking(value_from), "default", error=SecretsError)
+    assert message in output and "hunter2" not in output
 
 
 def test_a_controller_gives_no_secrets_unless_it_was_told_to(file: Path) -> None:

@@ -40,18 +40,18 @@ class Cluster:
         self.machine, self.store = Machine(), Store(store).open()
         self.states: dict[str, str] = {}
         """Of each job, by its number."""
-        self.asked = 0
+        self.requested = 0
         """Number of calls of squeue."""
-        self.away = False
+        self.absent = False
 
     def call(self, *command: str, **_: Any) -> str:
-        if self.away:
+        if self.absent:
             raise slurm_commands.SlurmUnreachable("slurmctld does not answer")
         if command[0] == "scancel" and len(command) == 2:
             self.states[command[1]] = "CANCELLED"
         if command[0] != "squeue":
             return ""
-        self.asked += 1
+        self.requested += 1
         return "\n".join(f"{number}|{state}|None|n1|job{number}/1/1" for number, state in self.states.items())
 
     def handle(self, number: str) -> Handle:
@@ -83,11 +83,11 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster
 
 def looks(engine: slurm.SlurmEngine, cluster: Cluster, seconds: float) -> int:
     """How often squeue is asked while the engine looks five times a second at all jobs, for so many seconds."""
-    before, handles = cluster.asked, [cluster.handle(number) for number in cluster.states]
+    before, handles = cluster.requested, [cluster.handle(number) for number in cluster.states]
     for _ in range(round(5 * seconds)):
         cluster.machine.time += 0.2
         engine.observe(handles)
-    return cluster.asked - before
+    return cluster.requested - before
 
 
 def test_squeue_is_asked_once_a_second_for_few_gangs_and_twice_a_minute_for_many(cluster: Cluster) -> None:
@@ -108,11 +108,11 @@ def test_the_interval_of_squeue_can_be_set_and_a_failure_is_tried_again_sooner(c
     cluster.begin("1")
     engine = slurm.SlurmEngine(120.0)
     assert looks(engine, cluster, 600.0) in (4, 5)
-    cluster.away = True
+    cluster.absent = True
     looks(engine, cluster, 121.0)
     [status] = engine.observe([cluster.handle("1")])
     assert isinstance(status, list) and status[0].stale == "Slurm: slurmctld does not answer"
-    cluster.away = False
+    cluster.absent = False
     assert looks(engine, cluster, 6.0) == 1
     [status] = engine.observe([cluster.handle("1")])
     assert isinstance(status, list) and status[0].stale == ""
@@ -128,12 +128,12 @@ def test_between_two_calls_of_squeue_starts_and_ends_are_seen_by_what_the_job_le
     cluster.states = {"1": "PENDING", "2": "PENDING"}
     engine = slurm.SlurmEngine(240.0)
     assert seen(engine, cluster, "1").phase is NodePhase.QUEUED
-    asked = cluster.asked
+    requested = cluster.requested
     cluster.begin("1")
     assert seen(engine, cluster, "1").phase is NodePhase.RUNNING
     cluster.end("1", 3)
     assert (seen(engine, cluster, "1").phase, seen(engine, cluster, "1").exit_code) == (NodePhase.ENDED, 3)
-    assert seen(engine, cluster, "2").phase is NodePhase.QUEUED and cluster.asked == asked
+    assert seen(engine, cluster, "2").phase is NodePhase.QUEUED and cluster.requested == requested
 
 
 def test_a_job_that_others_cancelled_says_so_and_one_that_muster_cancelled_does_not(cluster: Cluster) -> None:

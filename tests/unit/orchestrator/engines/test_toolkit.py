@@ -190,10 +190,10 @@ class Backend:
 
     def __init__(self) -> None:
         self.answers: SimpleQueue[str | Exception] = SimpleQueue()
-        self.asked = 0
+        self.requested = 0
 
     def __call__(self) -> str:
-        self.asked += 1
+        self.requested += 1
         answer = self.answers.get()
         if isinstance(answer, Exception):
             raise answer
@@ -209,13 +209,15 @@ def test_a_value_is_read_again_once_it_is_too_old_and_a_failure_leaves_it_and_sa
     view = view_of(backend)
     assert (view.value, view.taken, view.trouble) == ("nothing", -inf, "")
     backend.answers.put("first")
-    assert view.get(60.0) == "first" == view.get(60.0) and backend.asked == 1, "it holds for a minute"
+    assert view.get(60.0) == "first" == view.get(60.0) and backend.requested == 1, "it holds for a minute"
     for error, words in ((NotYet("away"), "away"), (KeyError("hosts"), "KeyError: 'hosts'")):
         backend.answers.put(error)
         with suppress(KeyError):
             assert view.get(0.0) == "first"
-        asked = backend.asked
-        assert view.get(60.0) == "first" and view.trouble == words and backend.asked == asked, "not again at once"
+        requested = backend.requested
+        assert view.get(60.0) == "first" and view.trouble == words and backend.requested == requested, (
+            "not again at once"
+        )
     backend.answers.put(EngineError("refused"))
     with pytest.raises(EngineError, match="refused"):
         view.read()
@@ -227,7 +229,7 @@ def test_a_backend_that_hangs_delays_one_caller_and_is_asked_once() -> None:
     backend = Backend()
     view = view_of(backend, patience=0.05)
     assert view.get(0.0) == "nothing" and view.trouble == "no answer yet"
-    assert [view.get(0.0) for _ in range(3)] == ["nothing"] * 3 and backend.asked == 1
+    assert [view.get(0.0) for _ in range(3)] == ["nothing"] * 3 and backend.requested == 1
     backend.answers.put("first")
     wait_for(lambda: view.value == "first" and not view.trouble, 10, "the answer")
 

@@ -65,18 +65,18 @@ def test_a_name_is_used_once_and_every_name_is_checked(keys: KeyStore, others: K
 
 
 @pytest.mark.parametrize(
-    ("name", "asked", "share"), [("ann", None, "ann"), ("ann-2.b_c", None, "ann2bc"), ("ann", "lab", "lab")]
+    ("name", "requested", "share"), [("ann", None, "ann"), ("ann-2.b_c", None, "ann2bc"), ("ann", "lab", "lab")]
 )
 def test_a_key_has_the_letters_and_digits_of_its_name_as_its_share(
-    keys: KeyStore, name: str, asked: str | None, share: str
+    keys: KeyStore, name: str, requested: str | None, share: str
 ) -> None:
-    assert keys.create(name, share=asked).share == share
+    assert keys.create(name, share=requested).share == share
     with pytest.raises(KeyUsageError, match=f"would have the share of key {name}: --share {share} shares it") as caught:
         keys.create(share + "_")
     assert "\n" not in str(caught.value)
     assert keys.create(share + "_", share=share).share == share
     older = {"name": name, "accessKeyId": "MSTR234567ABCDEFGHIJ", "secret": "s" * 40, "createdAt": 1}
-    assert asked or Key.model_validate(older).share == share
+    assert requested or Key.model_validate(older).share == share
 
 
 def test_a_look_that_fails_as_none_should_is_not_the_last_one(

@@ -171,11 +171,11 @@ def test_what_is_reserved_on_other_hosts_is_nothing_to_a_queue() -> None:
 
 
 def test_hosts_that_are_away_are_taken_for_the_smallest_gang_alone() -> None:
-    away, present = replace(host("a", 1), unavailable=True), host("b", 1)
+    absent, present = replace(host("a", 1), unavailable=True), host("b", 1)
 
     def where(most: int | None, minimum: int = 2, count: int = 3) -> str | None:
         found = place(
-            gang(*[node()] * count, minimum=minimum), [away, present, replace(host("c", 1), unavailable=True)], most
+            gang(*[node()] * count, minimum=minimum), [absent, present, replace(host("c", 1), unavailable=True)], most
         )
         return found and " ".join(each.host for each in found)
 

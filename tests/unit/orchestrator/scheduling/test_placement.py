@@ -105,8 +105,8 @@ def test_a_gang_never_fits_for_its_required_nodes_and_on_elastic_hosts_for_one_l
     )
 
 
-def single(name: str, cpus: float = 4, gpus: int = 0, away: bool = False) -> Host:
-    return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), 8192, single=True, unavailable=away)
+def single(name: str, cpus: float = 4, gpus: int = 0, absent: bool = False) -> Host:
+    return Host(name, cpus, tuple(f"{name}{i}" for i in range(gpus)), 8192, single=True, unavailable=absent)
 
 
 @pytest.mark.parametrize(
@@ -145,7 +145,7 @@ def test_what_the_queue_of_an_engine_gives_at_most_is_named_in_place_of_hosts() 
 
 
 def test_hosts_that_are_away_are_taken_only_where_the_gang_needs_them() -> None:
-    hosts = [single("a", away=True), single("b"), single("c")]
+    hosts = [single("a", absent=True), single("b"), single("c")]
     assert where(gang(*[node()] * 2), *hosts) == "b c"
     assert where(gang(*[node()] * 2, minimum=1), *hosts) == "b c"
     assert where(gang(*[node()] * 3, minimum=2), *hosts) == "b c", "fewer nodes start now"
@@ -177,8 +177,8 @@ def test_every_node_gets_what_it_needs_and_no_host_gives_more_than_it_has(
         assert never_fits(gang(*members, minimum=minimum), hosts)
         return
     assert minimum <= len(placements) <= len(members)
-    for placement, wanted in zip(placements, members, strict=False):
-        assert placement.resources == wanted
+    for placement, requested in zip(placements, members, strict=False):
+        assert placement.resources == requested
     for each in hosts:
         here = [placement for placement in placements if placement.host == each.name]
         assert sum(placement.cpus for placement in here) <= each.cpus + 1e-6

@@ -41,7 +41,7 @@ def shapes(draw: st.DrawFn) -> Shape:
     return gang(*members, minimum=draw(st.integers(1, len(members))))
 
 
-def begun(
+def started(
     job: Waiting, compute_environment: str, placements: object, now: int, preemptible: bool = False
 ) -> RunningGang:
     return RunningGang(
@@ -80,7 +80,7 @@ def check_pass(snapshot: Snapshot, decisions: Decisions) -> None:
         assert start.compute_environment in snapshot.queues[job.queue].compute_environments
         assert snapshot.compute_environments[start.compute_environment].enabled
         assert {placement.host for placement in start.placements} <= {each.name for each in snapshot.hosts}
-        running.append(begun(job, start.compute_environment, start.placements, snapshot.now))
+        running.append(started(job, start.compute_environment, start.placements, snapshot.now))
     check_capacity(snapshot.hosts, snapshot.compute_environments, running)
     gone = {start.job for start in decisions.starts} | {cancel.job for cancel in decisions.cancels}
     assert len(gone) == len(decisions.starts) + len(decisions.cancels)
@@ -159,7 +159,7 @@ def test_jobs_that_pass_the_head_do_not_delay_it(
     first = decide(snapshot_of(hosts, earlier, [], NOW))
     by_id = {job.job: job for job in earlier + waiting}
     running = [
-        begun(by_id[start.job], start.compute_environment, start.placements, NOW - 1000 * age)
+        started(by_id[start.job], start.compute_environment, start.placements, NOW - 1000 * age)
         for start, age in zip(first.starts, ages, strict=False)
         if by_id[start.job].timeout is None or by_id[start.job].timeout > age
     ]
@@ -171,7 +171,7 @@ def test_jobs_that_pass_the_head_do_not_delay_it(
     if not heads:
         return
     reservation = heads[0]
-    starts = [begun(by_id[start.job], start.compute_environment, start.placements, NOW) for start in decisions.starts]
+    starts = [started(by_id[start.job], start.compute_environment, start.placements, NOW) for start in decisions.starts]
     before = [each for each in starts if by_id[each.job].created_at < reservation.created_at]
     promised = earliest(reservation.shape, hosts, [*running, *before], NOW)
     assert promised > NOW
@@ -198,7 +198,7 @@ def test_every_job_starts_no_later_than_was_promised_when_it_first_was_the_head(
         for start in decisions.starts:
             assert now <= promised.get(start.job, inf)
             ends[start.job] = now + lengths[start.job]
-            running.append(begun(left.pop(start.job), start.compute_environment, start.placements, now))
+            running.append(started(left.pop(start.job), start.compute_environment, start.placements, now))
         for job in decisions.report.order("default"):
             if decisions.report.reason(job).aws.startswith("CAPACITY"):
                 promised.setdefault(job, earliest(left[job].shape, hosts, running, now))
@@ -314,7 +314,7 @@ class Cluster(RuleBasedStateMachine):
         self.run_pass()
 
     @invariant()
-    def nothing_is_given_out_twice(self) -> None:
+    def nothing_is_supplied_out_twice(self) -> None:
         check_capacity(self.hosts.values(), COMPUTE_ENVIRONMENTS, self.running.values())
 
     def teardown(self) -> None:
@@ -354,7 +354,7 @@ class Cluster(RuleBasedStateMachine):
         self.turns = self.decisions.turns
         for start in self.decisions.starts:
             job, preemptible = self.jobs[start.job]
-            self.running[start.job] = begun(job, start.compute_environment, start.placements, self.now, preemptible)
+            self.running[start.job] = started(job, start.compute_environment, start.placements, self.now, preemptible)
             del self.waiting[start.job]
         for preempt in self.decisions.preempts:
             assert QUEUES[self.jobs[preempt.by][0].queue].priority >= QUEUES[self.running[preempt.job].queue].priority

@@ -51,21 +51,21 @@ def test_a_job_that_can_never_start_says_so_even_behind_one_that_waits_and_delay
 
 def test_while_an_engine_has_not_told_its_hosts_its_jobs_wait_and_say_so() -> None:
     silent = replace(environment("silent", hosts=()), unknown="the ray engine has not answered yet")
-    there = environment("there")
+    existing = environment("there")
     queues = [queue("silent", environments=("silent",)), queue("both", environments=("silent", "there"))]
     waiting = line(job("ant", queue="silent"), job("cart", queue="both"), job("huge", 64, queue="both"))
-    decided = Pass([host()], waiting, (), queues, [silent, there])
+    decided = Pass([host()], waiting, (), queues, [silent, existing])
     assert decided.started == "cart:a", "in a compute environment that is known"
     assert decided.reason("ant") == f"{CAPACITY} - the ray engine has not answered yet; {needs(1)}"
     assert f"{CAPACITY} - {silent.unknown}; " in decided.reason("huge"), "it may have that much"
     waiting = line(job("large", 4, queue="both"), job("next", 3, queue="both"))
     cart = running("cart", on("a", 1), environment="there")
-    assert "behind job large" in Pass([host()], waiting, [cart], queues, [silent, there]).reason("next")
+    assert "behind job large" in Pass([host()], waiting, [cart], queues, [silent, existing]).reason("next")
     quiet = replace(environment("quiet", hosts=()), unknown="the slurm engine has not answered yet")
     waiting, queues[1] = [job("ant", queue="both")], queue("both", environments=("quiet", "silent"))
     assert f"- {quiet.unknown}; " in Pass([], waiting, (), queues, [silent, quiet]).reason("ant"), "its first one"
     queues[1] = queue("both", environments=("silent", "there"))
-    requested = fit(gang(node(64)), queues[1], {"silent": silent, "there": there}, [host()])
+    requested = fit(gang(node(64)), queues[1], {"silent": silent, "there": existing}, [host()])
     assert (requested.allocation, requested.problem) == (None, None), "it is not refused"
 
 

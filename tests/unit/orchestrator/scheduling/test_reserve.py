@@ -23,7 +23,7 @@ def reserved(
     return reserve(requested, tuple(known), free, [holder_of(each, NOW, each.ending) for each in held])
 
 
-def told(found: Reservation | None) -> tuple[float, str, str]:
+def reported(found: Reservation | None) -> tuple[float, str, str]:
     """Seconds until the start, the hosts, and the gangs that it waits for."""
     assert found is not None
     hosts = " ".join(placement.host for placement in found.allocation.placements)
@@ -43,21 +43,21 @@ def test_it_starts_at_the_first_end_that_makes_room_and_awaits_those_on_its_host
         ends("middle", 200, ("b", 2)),
         ends("other", 50, ("a", 0)),
     ]
-    assert told(reserved(job("x", 4), held)) == (200, "b", "early middle")
-    assert told(reserved(job("x", 3), held)) == (200, "b", "early middle")
-    assert told(reserved(job("x", 2), held)) == (100, "b", "early")
-    assert told(reserved(job("x", gang(node(4), node(4))), held)) == (300, "a b", "other early middle late")
+    assert reported(reserved(job("x", 4), held)) == (200, "b", "early middle")
+    assert reported(reserved(job("x", 3), held)) == (200, "b", "early middle")
+    assert reported(reserved(job("x", 2), held)) == (100, "b", "early")
+    assert reported(reserved(job("x", gang(node(4), node(4))), held)) == (300, "a b", "other early middle late")
     assert reserved(job("x", 5), held) is None
 
 
 def test_all_that_end_at_that_time_make_room_and_those_without_a_known_end_come_last() -> None:
     held = [ends("x", 100, ("a", 2)), ends("y", 100, ("a", 1)), ends("z", None, ("b", 4)), ends("w", 200, ("a", 1))]
     found = reserved(job("j", 2), held)
-    assert told(found) == (100, "a", "x y") and found is not None
+    assert reported(found) == (100, "a", "x y") and found is not None
     assert found.window.hosts == {"a": host("a", 1, memory=8092)} and found.window.cpus == inf
-    assert told(reserved(job("j", gang(node(4), node(4))), held)) == (inf, "a b", "x y w z")
+    assert reported(reserved(job("j", gang(node(4), node(4))), held)) == (inf, "a b", "x y w z")
     stopping = [ends("s", None, ("a", 2), ending=True), *held[2:]]
-    assert told(reserved(job("j", 3), stopping)) == (0, "a", "s")
+    assert reported(reserved(job("j", 3), stopping)) == (0, "a", "s")
 
 
 def test_the_smallest_gang_is_reserved_and_the_limit_of_its_environment_counts() -> None:
@@ -65,7 +65,7 @@ def test_the_smallest_gang_is_reserved_and_the_limit_of_its_environment_counts()
     hosts = [host("a", 4), host("b", 4), host("c", 9)]
     held = [ends("x", 100, ("c", 3), environment="p"), ends("y", 200, ("a", 2), environment="p")]
     found = reserved(job("j", gang(*[node(2)] * 3, minimum=2)), held, hosts, limited)
-    assert told(found) == (100, "a b", "x") and found is not None
+    assert reported(found) == (100, "a b", "x") and found is not None
     assert (found.window.compute_environment, found.window.cpus) == ("p", 0)
     assert found.hosts == {"a", "b", "c"} and found.compute_environments == ("p", "q")
 

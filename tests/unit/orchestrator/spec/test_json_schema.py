@@ -100,7 +100,7 @@ def spec(**changes: Any) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(
-    ("given", "kept"),
+    ("supplied", "kept"),
     [
         ("wandb", {"wandb": {"tags": []}}),
         (["wandb", "mlflow"], {"wandb": {"tags": []}, "mlflow": {"tags": {}}}),
@@ -112,10 +112,10 @@ def spec(**changes: Any) -> dict[str, Any]:
         ({"mlflow": {"uri": "http://host:5000/a"}}, {"mlflow": {"uri": "http://host:5000/a", "tags": {}}}),
     ],
 )
-def test_services_are_named_alone_in_a_list_or_with_their_settings(given: Any, kept: Any) -> None:
-    found = validate(spec(track=given), "job.yaml")
+def test_services_are_named_alone_in_a_list_or_with_their_settings(supplied: Any, kept: Any) -> None:
+    found = validate(spec(track=supplied), "job.yaml")
     assert found.track is not None and found.track.model_dump(mode="json", exclude_none=True) == kept
-    assert accepts(spec(track=given))
+    assert accepts(spec(track=supplied))
     again = validate(found.model_dump(mode="json", exclude_none=True), "run.json")
     assert again == found  # as a run that is resumed reads it
 

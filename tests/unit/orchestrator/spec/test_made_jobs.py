@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from orchestrator.domain.errors import SpecError
-from orchestrator.spec.evaluations import Counted, automatic_evaluation, due, first_count, place_of, wanted_of
+from orchestrator.spec.evaluations import Counted, automatic_evaluation, due, evaluation_settings, first_count, place_of
 from orchestrator.spec.sections import Evaluation
 from shared_store.volume.checkpoints import Checkpoint
 
@@ -74,7 +74,7 @@ def test_the_job_has_one_node_like_those_of_the_training_where_the_section_says_
     assert (spec.nodes.max, spec.resources.gpus, spec.resources.cpus, spec.environment) == (1, 1, 4.0, {"NOTE": "a"})
     assert (spec.priority, spec.preemptible, spec.retry.attempts) == (0, True, 3)
     section = {"every": 1, "queue": "idle", "resources": {"cpus": 0.5, "memory": 512}, "retry": {"attempts": 1}}
-    expected = wanted_of({**TRAINED, "evaluation": section})
+    expected = evaluation_settings({**TRAINED, "evaluation": section})
     assert expected is not None
     spec = automatic_evaluation("ant-1", TRAINED, place_of("slow", expected, "a"), expected, 40)
     assert (spec.queue, spec.share, spec.resources.cpus, spec.resources.memory) == ("idle", None, 0.5, 512)
@@ -89,7 +89,12 @@ def test_the_evaluations_of_a_training_that_accepts_a_changed_robot_accept_it_to
 
 
 def test_a_spec_of_the_batch_api_is_read_with_care() -> None:
-    assert wanted_of({"train": "x", "evaluation": {"every": 1}}) is None
-    assert wanted_of(None) is wanted_of(TRAINED) is wanted_of({"command": ["x"], "evaluation": {"every": 1}}) is None
+    assert evaluation_settings({"train": "x", "evaluation": {"every": 1}}) is None
+    assert (
+        evaluation_settings(None)
+        is evaluation_settings(TRAINED)
+        is evaluation_settings({"command": ["x"], "evaluation": {"every": 1}})
+        is None
+    )
     with pytest.raises(SpecError, match=r"^evaluation\.every: expected a value greater than or equal to 1, found 0$"):
-        wanted_of({**TRAINED, "evaluation": {"every": 0}})
+        evaluation_settings({**TRAINED, "evaluation": {"every": 0}})

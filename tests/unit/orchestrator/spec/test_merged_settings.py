@@ -52,7 +52,7 @@ def job(path: Path, task: str, algorithm: str, settings: str) -> str:
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "key", "value", "said"),
+    ("algorithm", "key", "value", "output"),
     [
         ("ppo", "hidden_sizes", [], "hidden_sizes: expected at least one number, found []"),
         ("ppo", "epochs", 2.5, "epochs: expected an integer, found a number (2.5)"),
@@ -68,21 +68,21 @@ def job(path: Path, task: str, algorithm: str, settings: str) -> str:
     ],
 )
 def test_submission_and_rank_refuse_a_setting_in_the_same_words(
-    algorithm: str, key: str, value: Any, said: str
+    algorithm: str, key: str, value: Any, output: str
 ) -> None:
     section = {"task": "Cartpole", "worlds": 8, "iterations": 1, "algorithm": algorithm, algorithm: {key: value}}
     submission = refusal(validate, {"name": "job", "train": section}, "job.yaml", error=SpecError)
     rank = refusal(settings_of, find_algorithm(algorithm), algorithm, CartpoleConfig(), section, error=UserError)
-    assert (rank, submission) == (f"train.{algorithm}.{said}", f"job.yaml: {rank}")
+    assert (rank, submission) == (f"train.{algorithm}.{output}", f"job.yaml: {rank}")
 
 
 @pytest.mark.parametrize("case", WRONG)
 def test_rules_over_several_settings_are_refused_with_file_line_and_key(tmp_path: Path, case: str) -> None:
-    (task, algorithm, settings), said = case.split(" ", 2), WRONG[case]
+    (task, algorithm, settings), output = case.split(" ", 2), WRONG[case]
     path = job(tmp_path, task, algorithm, settings)
-    key = f"train.{algorithm}" + ("." if said.partition(":")[0].isidentifier() else ": ")
-    given = settings.partition(":")[0] == said.partition(":")[0]
-    assert refusal(load, path, error=SpecError) == f"{path}:{8 if given else 7}: {key}{said}"
+    key = f"train.{algorithm}" + ("." if output.partition(":")[0].isidentifier() else ": ")
+    supplied = settings.partition(":")[0] == output.partition(":")[0]
+    assert refusal(load, path, error=SpecError) == f"{path}:{8 if supplied else 7}: {key}{output}"
 
 
 def test_settings_of_the_job_override_those_of_the_task(tmp_path: Path) -> None:
@@ -114,8 +114,8 @@ def test_a_number_that_json_does_not_have_is_refused_wherever_it_stands(
     tmp_path: Path, algorithm: str, settings: str, key: str, found: str
 ) -> None:
     path = job(tmp_path, "Ant", algorithm, settings)
-    said = f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
-    assert refusal(load, path, error=SpecError) == said
+    output = f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
+    assert refusal(load, path, error=SpecError) == output
 
 
 def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) -> None:
@@ -123,8 +123,8 @@ def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) 
     text = "name: a\ntrain:\n  task: Ant\n  worlds: 4\n  iterations: 2\n  algorithm: {}\n  {}: {{epochs: 3}}\n"
     for algorithm, section, belongs in (("sac", "ppo", "sac"), ("my_module:Mine", "ppo", "settings")):
         file.write_text(text.format(algorithm, section))
-        said = f"train.{section}: the algorithm is {algorithm}, so its settings belong under train.{belongs}"
-        assert refusal(load, str(file), error=SpecError) == f"{file}:7: {said}"
+        output = f"train.{section}: the algorithm is {algorithm}, so its settings belong under train.{belongs}"
+        assert refusal(load, str(file), error=SpecError) == f"{file}:7: {output}"
 
 
 HOPPER = {

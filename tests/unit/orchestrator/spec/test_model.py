@@ -98,8 +98,8 @@ PPO = {
 }
 """Of settings of ppo."""
 FILES: dict[str, str] = {
-    **{f"{COMMAND}{line}\n": f":3: {said}" for line, said in LINES.items()},
-    **{ppo(settings): f":6: train.ppo.{said}" for settings, said in PPO.items()},
+    **{f"{COMMAND}{line}\n": f":3: {output}" for line, output in LINES.items()},
+    **{ppo(settings): f":6: train.ppo.{output}" for settings, output in PPO.items()},
     f"name: a\n{TRAIN}\nnodez: 2\n": ":3: nodez: unknown key; did you mean nodes?",
     f"name: a\n{TRAIN}\nxyzzyq: 2\n": f":3: xyzzyq: unknown key; valid here: {TOP}",
     f"name: a\n{TRAIN}\nrally: {{run: x}}\n": f":3: rally: unknown key; valid here: {TOP} ({OF_PLUGIN})",
@@ -175,8 +175,8 @@ def test_text_that_is_not_yaml_is_reported_with_its_line(tmp_path: Path, text: s
 
 
 def test_a_file_that_can_not_be_read_is_named(tmp_path: Path) -> None:
-    for path, said in ((tmp_path / "none.yaml", "No such file or directory"), (tmp_path, "Is a directory")):
-        assert refusal(load, str(path), error=SpecError) == f"{path}: {said}"
+    for path, output in ((tmp_path / "none.yaml", "No such file or directory"), (tmp_path, "Is a directory")):
+        assert refusal(load, str(path), error=SpecError) == f"{path}: {output}"
 
 
 VALUES = st.none() | st.booleans() | st.integers(-3, 300) | st.floats() | st.text(max_size=6)
@@ -317,12 +317,12 @@ def test_a_file_may_use_aliases_while_they_stand_for_little(tmp_path: Path) -> N
     (tmp_path / "job.yaml").write_text(f"name: a\ntrain: {train}\n")
     loaded = load(str(tmp_path / "job.yaml")).train
     assert loaded is not None and loaded.config == {"first": {"size": 3}, "second": {"size": 3}}
-    said = problem(tmp_path, f"name: a\n{TRAIN}\nenvironment: {{{bomb(7)}}}\n")
-    assert said == "job.yaml:3: not valid YAML: more than 10000 values with the aliases written out"
+    output = problem(tmp_path, f"name: a\n{TRAIN}\nenvironment: {{{bomb(7)}}}\n")
+    assert output == "job.yaml:3: not valid YAML: more than 10000 values with the aliases written out"
 
 
 @pytest.mark.parametrize(
-    ("value", "said"),
+    ("value", "output"),
     [
         (f"{{{bomb(9)}}}", "train.config.a0): anchors and aliases (&a0) are not accepted here; write the value out"),
         ("[" * 5000, "nested deeper than 50 levels"),
@@ -332,6 +332,6 @@ def test_a_file_may_use_aliases_while_they_stand_for_little(tmp_path: Path) -> N
         (f"'{'x' * 30_000}'", "30015 characters of changes; at most 24576"),
     ],
 )
-def test_a_change_beyond_a_limit_is_refused_in_one_short_line_that_names_it(value: str, said: str) -> None:
+def test_a_change_beyond_a_limit_is_refused_in_one_short_line_that_names_it(value: str, output: str) -> None:
     refused = refusal(override, {}, [f"train.config={value}"], error=SpecError)
-    assert said in refused and len(refused) < 400
+    assert output in refused and len(refused) < 400

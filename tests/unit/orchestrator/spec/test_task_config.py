@@ -109,8 +109,8 @@ def test_the_line_is_that_of_the_value_and_a_change_has_none(tmp_path: Path) -> 
     with pytest.raises(SpecError, match=r"job\.yaml:10: train\.config\.rewards\.foward: the task has no term"):
         load(str(path))
     path.write_text("name: a\ntrain: {task: Ant, worlds: 4, iterations: 2}\n")
-    said = refusal(load, str(path), ["train.config.fall_height=low"], error=SpecError)
-    assert said == "--set: train.config.fall_height: expected a number, found a string ('low')"
+    output = refusal(load, str(path), ["train.config.fall_height=low"], error=SpecError)
+    assert output == "--set: train.config.fall_height: expected a number, found a string ('low')"
 
 
 def test_every_installed_task_publishes_the_class_that_its_rank_uses() -> None:
@@ -199,12 +199,12 @@ def reach(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("reach")
 def test_a_task_of_an_installed_package_is_checked_by_the_class_that_it_names() -> None:
     submit("Reach", {"reach": 1, "rewards": {"near": 2}})
-    for config, said in (
+    for config, output in (
         ({"reach": "far"}, "reach: expected a number, found a string ('far')"),
         ({"rewards": {"nera": 1}}, "rewards.nera: the task has no term 'nera'; did you mean near?"),
         ({"substeps": 0}, "substeps: expected a value greater than or equal to 1, found 0"),
     ):
-        assert refusal(submit, "Reach", config, error=SpecError) == f"job.yaml: train.config.{said}"
+        assert refusal(submit, "Reach", config, error=SpecError) == f"job.yaml: train.config.{output}"
 
 
 @pytest.mark.usefixtures("reach")

@@ -33,6 +33,6 @@ def reward_function(params):
     heading = math.radians(params["heading"])
     after = line[(first + 1) % len(line)]
     before = line[first]
-    wanted = math.atan2(after[1] - before[1], after[0] - before[0])
-    miss = abs(math.atan2(math.sin(wanted - heading), math.cos(wanted - heading)))
+    requested = math.atan2(after[1] - before[1], after[0] - before[0])
+    miss = abs(math.atan2(math.sin(requested - heading), math.cos(requested - heading)))
     return max(1e-3, 1 - distance / (params["track_width"] * 0.5)) + (1.0 - miss / math.pi)

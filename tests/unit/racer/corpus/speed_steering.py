@@ -1,7 +1,7 @@
 SPEEDS = {0: 3.5, 15: 2.0, 30: 1.2}
 
 
-def wanted_speed(angle):
+def expected_speed(angle):
     if angle < 7.5:
         return SPEEDS[0]
     if angle < 22.5:
@@ -10,8 +10,8 @@ def wanted_speed(angle):
 
 
 def reward_function(params):
-    wanted = wanted_speed(abs(params["steering_angle"]))
-    miss = abs(params["speed"] - wanted) / wanted
+    requested = expected_speed(abs(params["steering_angle"]))
+    miss = abs(params["speed"] - requested) / requested
     reward = max(1e-3, 1.0 - miss)
     if params["is_offtrack"] or params["is_crashed"] or params["is_reversed"]:
         reward = 1e-3

@@ -57,8 +57,8 @@ seconds = st.integers(0, 100_000).map(lambda n: n / 100)
         bus_token=st.none() | names,
     )
 )
-def test_a_node_reads_its_engine_s_variables(given_contract: NodeContract) -> None:
-    assert NodeContract.from_env(given_contract.to_env()) == given_contract
+def test_a_node_reads_its_engine_s_variables(supplied_contract: NodeContract) -> None:
+    assert NodeContract.from_env(supplied_contract.to_env()) == supplied_contract
 
 
 def test_aws_variables_are_exactly_those_of_aws_on_the_main_node() -> None:

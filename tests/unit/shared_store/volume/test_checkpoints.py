@@ -161,11 +161,11 @@ def test_an_uncommitted_checkpoint_is_not_listed_and_one_that_is_gone_can_not_be
 
 def test_nothing_is_committed_into_the_mount_point_of_a_volume_that_is_gone(run: Run) -> None:
     writer = CheckpointWriter(run, 50, 1)
-    away = run.path.rename(run.path.with_name("away"))
+    absent = run.path.rename(run.path.with_name("away"))
     with pytest.raises(FileNotFoundError):
         writer.commit({}, None, {"rank-0.pt": {"size": 0, "sha256": ""}})
     assert not run.path.exists()
-    away.rename(run.path)
+    absent.rename(run.path)
     assert commit(run, 50).name == "00000050-e1"
 
 
@@ -277,14 +277,14 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damage_is_named_and_the_checkpoint_before_it_is_used(run: Run, damage: str) -> None:
-    harm, said = DAMAGES[damage]
+    harm, output = DAMAGES[damage]
     commit(run, 25)
     harm(commit(run, 50).path)
     named: list[tuple[str, str]] = []
     result = newest(run, damaged=lambda checkpoint, error: named.append((checkpoint.name, str(error))))
     [(name, message)] = named
     assert (result, name) == ("00000025-e1", "00000050-e1")
-    assert message.startswith(f"checkpoint 00000050-e1: {said}")
+    assert message.startswith(f"checkpoint 00000050-e1: {output}")
 
 
 def test_a_damaged_checkpoint_is_set_aside_durably_under_a_name_of_its_own_and_not_deleted(

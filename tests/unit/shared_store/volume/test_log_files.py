@@ -195,7 +195,7 @@ def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_begin
     path = run.log("job", 1, 0)
     LogWriter(path).append(lines_of(0, 100))
     follower, file = LogView.of(run, "job"), LogFile(path, "stream")
-    assert len(follower.poll()) == 100 and file.look().begun == 1
+    assert len(follower.poll()) == 100 and file.look().started == 1
     if how == "truncated":
         os.truncate(path, 0)
         assert [line.text for line in follower.poll()] == [REPLACED]
@@ -207,7 +207,7 @@ def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_begin
     assert numbers(texts)[0] == 500 and len(numbers(texts)) == (60 if "shorter" in how else 300)
     assert [line.text for line in follower.poll()] == []
     view = file.look()
-    assert view.begun == 2 and numbers([event.text for event in view.forward()])[0] == 500
+    assert view.started == 2 and numbers([event.text for event in view.forward()])[0] == 500
 
 
 def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: Run) -> None:

@@ -245,7 +245,7 @@ def test_a_line_that_is_longer_than_a_piece_is_in_a_window_like_any_other(tmp_pa
 
 def test_a_search_finds_every_line_with_the_text_and_goes_on_after_the_last_one(kept: Run) -> None:
     chosen = Chosen(kept, JOB)
-    wanted = {(line.attempt, line.text) for line in LogView.of(kept, JOB).drain() if "line 12" in line.text}
+    requested = {(line.attempt, line.text) for line in LogView.of(kept, JOB).drain() if "line 12" in line.text}
     found, place = list[LogLine](), {}
     while True:
         part = search(chosen, "LINE 12", place, 10)
@@ -253,7 +253,7 @@ def test_a_search_finds_every_line_with_the_text_and_goes_on_after_the_last_one(
         if part.is_over:
             break
         assert len(part.lines) == 10
-    assert {(line.attempt, line.text) for line in found} == wanted and len(found) == len(wanted)
+    assert {(line.attempt, line.text) for line in found} == requested and len(found) == len(requested)
     of_rank = search(Chosen(kept, JOB, rank=3), "line", {}, 10_000).lines
     assert of_rank and all(line.rank == 3 and line.node == 1 for line in of_rank)
     (line,) = lines_before(chosen, {f"{found[5].attempt}/{found[5].node}": found[5].position}, 1).lines

@@ -44,7 +44,7 @@ WRONG: list[dict[str, Any]] = [
     {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1e300}},
     {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": "x"}},
     {"error": {"rank": 0, "message": "m", "traceback": "", "time": 1.0, "fault": {"type": "x"}}},
-    *({"error": [1]}, {"error": "x"}, {"other": 1}, {"asked": 1}),
+    *({"error": [1]}, {"error": "x"}, {"other": 1}, {"requested": 1}),
 ]
 
 
@@ -73,9 +73,11 @@ def test_the_first_that_was_not_asked_to_end_is_the_cause(ends: list[tuple[bool,
     assert node_outcomes.first_cause(ends) == cause
 
 
-def test_an_outcome_is_read_as_it_was_written_and_one_of_an_older_version_was_not_asked() -> None:
-    asked = replace(OUTCOME, asked=True)
-    written = asdict(asked)
-    assert node_outcomes.parse_outcome(written) == asked
+def test_an_outcome_is_read_as_it_was_written_and_so_is_one_of_an_older_version() -> None:
+    requested = replace(OUTCOME, requested=True)
+    written = asdict(requested)
+    assert node_outcomes.parse_outcome(written) == requested
+    written["asked"] = written.pop("requested")
+    assert node_outcomes.parse_outcome(written) == requested
     del written["asked"]
     assert node_outcomes.parse_outcome(written) == OUTCOME

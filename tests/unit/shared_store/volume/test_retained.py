@@ -93,13 +93,13 @@ def test_a_directory_is_moved_whole_and_what_a_killed_controller_left_is_swept(s
     run = logged(store, "r")
     assert trash.size_of(run.path)[1] == 3
     other = logged(store, "other")
-    [thrown, _], _ = trash.throw_away(store, [run.path, store.run("none").path, other.path])
+    [thrown, _], _ = trash.discard(store, [run.path, store.run("none").path, other.path])
     assert not run.path.exists() and not other.path.exists() and (thrown / "run.json").is_file()
-    assert trash.throw_away(store, [run.path]) == ([], {})
+    assert trash.discard(store, [run.path]) == ([], {})
     logged(store, "r2")
     assert trash.empty(store) == [] and os.listdir(store.path / "trash") == []
     assert store.run("r2").path.is_dir() and trash.empty(store) == []
-    trash.throw_away(store, [store.run("r2").path])
+    trash.discard(store, [store.run("r2").path])
     (store.path / "trash" / "stray").write_text("x")
     os.symlink(store.path / "runs", store.path / "trash" / "out")
     assert trash.empty(store) == [] and (store.path / "runs").is_dir(), "links in the trash lead nowhere"
@@ -115,7 +115,7 @@ def test_directories_that_may_not_be_written_are_kept_where_they_are_and_removed
     deep.parent.chmod(0o555)
     fixed.path.chmod(0o555)
     with permissions_count():
-        thrown, kept = trash.throw_away(store, [fixed.path, open_.path])
+        thrown, kept = trash.discard(store, [fixed.path, open_.path])
         assert list(kept) == [fixed.path] and fixed.path.is_dir() and len(thrown) == 1
         assert trash.remove(thrown[0]) and trash.empty(store) == []
         assert os.stat(fixed.path).st_mode & 0o777 == 0o555, "a link is removed, not followed"
@@ -123,7 +123,7 @@ def test_directories_that_may_not_be_written_are_kept_where_they_are_and_removed
 
 def test_what_can_t_be_removed_is_named_and_the_rest_goes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     stuck, other = logged(store, "stuck"), logged(store, "other")
-    [existing, _], _ = trash.throw_away(store, [stuck.path, other.path])
+    [existing, _], _ = trash.discard(store, [stuck.path, other.path])
     is_held = True
     remove = shutil.rmtree
 
@@ -144,13 +144,13 @@ def test_nothing_outside_of_the_store_is_thrown_away(store: Store, tmp_path: Pat
     os.rename(run.path / "logs", run.path / "kept")
     os.symlink(outside / "logs", run.path / "logs")
     with pytest.raises(DamagedFile):
-        trash.throw_away(store, [run.path / "logs" / "j1"])
+        trash.discard(store, [run.path / "logs" / "j1"])
     with pytest.raises(ValueError):
-        trash.throw_away(store, [outside])
+        trash.discard(store, [outside])
     (store.path / "trash").rmdir()
     os.symlink(outside, store.path / "trash")
     with pytest.raises(DamagedFile):
-        trash.throw_away(store, [run.path])
+        trash.discard(store, [run.path])
     assert trash.empty(store) == [] and (outside / "logs" / "j1" / "a").is_file()
 
 

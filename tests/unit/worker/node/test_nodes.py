@@ -19,7 +19,7 @@ def contract(node: int, nodes: int, address: str) -> NodeContract:
     return NodeContract("job", 1, node, nodes, 0, address, 29500, "run", "/store", 1, 1, address=address)
 
 
-def heard(main: MainEnd) -> Loss:
+def received(main: MainEnd) -> Loss:
     found: Loss = wait_for(main.lost, 10, "a loss")
     return found
 
@@ -31,13 +31,13 @@ def test_a_childs_last_message_counts_and_a_cut_connection_is_a_death() -> None:
         child.attach()
     del child
     assert main.lost() is None
-    children[0].tell(0, "done")
-    children[1].tell(75, "checkpointed and left on request")
+    children[0].report(0, "done")
+    children[1].report(75, "checkpointed and left on request")
     del children[0], children[0]
     assert main.lost() is None, "neither is a failure"
-    children[0].tell(3, "rank 3 exited with code 3")
+    children[0].report(3, "rank 3 exited with code 3")
     del children[0]
-    assert heard(main) == Loss("node 3: rank 3 exited with code 3", 3)
+    assert received(main) == Loss("node 3: rank 3 exited with code 3", 3)
     assert main.lost() is None, "told once"
 
 
@@ -50,7 +50,7 @@ def test_a_cut_connection_is_a_death_and_that_of_a_stranger_is_not() -> None:
     stranger.close()
     assert main.lost() is None
     del child
-    assert heard(main).reason == "node 1 vanished: its supervisor or its host died"
+    assert received(main).reason == "node 1 vanished: its supervisor or its host died"
 
 
 def test_messages_that_no_child_sends_are_ignored() -> None:
@@ -67,7 +67,7 @@ def test_messages_that_no_child_sends_are_ignored() -> None:
         time.sleep(0.01)
     with socket.create_connection(("127.91.0.4", lifeline.PORT)) as child:
         child.sendall(json.dumps({"gang": ours, "node": 1, "code": 3}).encode() + b"\n")
-    assert heard(main) == Loss("node 1: ", 3), "one that lost half of its last word"
+    assert received(main) == Loss("node 1: ", 3), "one that lost half of its last word"
 
 
 def test_a_child_that_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -75,13 +75,13 @@ def test_a_child_that_never_comes(monkeypatch: pytest.MonkeyPatch) -> None:
     main = MainEnd(contract(0, 3, "127.91.0.3"))
     child = ChildEnd(contract(1, 3, "127.91.0.3"))
     child.attach()
-    assert heard(main).reason.startswith("node 2 has not come within")
+    assert received(main).reason.startswith("node 2 has not come within")
 
 
 def test_a_node_gets_slurms_variables_but_not_the_token_that_its_controller_called_sbatch_with() -> None:
     contract = NodeContract("job", 1, 0, 1, 0, "127.0.0.1", 29500, "run", "/store", 1, 1)
-    told = {"kind": [0], "kinds": [{"environment": {"LEVEL": "3"}}]}
-    found = environment_of(told, contract, {"SLURM_JWT": "secret", "SLURM_NNODES": "2", "PATH": "/bin"})
+    reported = {"kind": [0], "kinds": [{"environment": {"LEVEL": "3"}}]}
+    found = environment_of(reported, contract, {"SLURM_JWT": "secret", "SLURM_NNODES": "2", "PATH": "/bin"})
     assert "secret" not in found.values()
     assert (found["SLURM_NNODES"], found["MUSTER_RUN"]) == ("2", "run")
     assert job_variables(found) == {"LEVEL": "3"}
