@@ -29,7 +29,6 @@ NAMES = {
     "tell": "report, send",
     "telling": "report",
     "begun": "started",
-    "spent": "counted, used",
     "away": "unavailable, absent",
     "glance": "preview, summary",
     "thing": "value, item",
@@ -92,10 +91,11 @@ def findings(path: Path, source: str) -> Iterator[tuple[int, str, str]]:
         if token.type == tokenize.NAME:
             if token.line.startswith(("from hypothesis", "import hypothesis")):
                 imported.add(token.string)
-            if token.string not in imported:
-                yield from (
-                    (token.start[0], f"{token.string}: {word}", plain) for word, plain in in_names(token.string)
-                )
+            if token.string.startswith("test_"):  # a sentence
+                yield from ((token.start[0], *rest) for _, *rest in in_text(token.string.replace("_", " ")))  # type: ignore[misc]
+            elif token.string not in imported:
+                found = in_names(token.string)
+                yield from ((token.start[0], f"{token.string}: {word}", plain) for word, plain in found)
         elif token.type in (tokenize.STRING, tokenize.COMMENT):
             yield from ((token.start[0] + line, word, plain) for line, word, plain in in_text(token.string))
 

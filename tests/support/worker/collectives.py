@@ -183,10 +183,10 @@ TESTS = {
     f"{file}:{function}": f"test_{case}"
     for case, files in {
         "a_training_is_the_same_on_all_ranks_to_its_end": {
-            "learning/distributed.py": "Gang.broadcast Gang.build_in_turn Gang.greatest Gang.sum Gang.tell connect",
+            "learning/distributed.py": "Gang.broadcast Gang.broadcast_text Gang.build_in_turn Gang.greatest Gang.sum connect",
             "evaluation/evaluation.py": "evaluate",
             "evaluation/final_evaluation.py": "FinalEvaluation.trained",
-            "learning/training.py": "as_begun",
+            "learning/training.py": "as_started",
             "learning/exchange.py": "Exchange.gather",
             "learning/leaving.py": "train",
             "learning/loop.py": "Loop.__init__ Loop._begin_run Loop._iterate Loop.train",

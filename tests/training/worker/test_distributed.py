@@ -155,7 +155,7 @@ def test_ranks_that_torchrun_starts_meet_at_its_store(tmp_path: Path) -> None:
         "gang = connect(RankPlacement.from_env(os.environ), device='cpu')\n"
         "total = gang.sum(torch.tensor([gang.rank + 1.0])).item()\n"
         # one write each: two ranks share this pipe
-        "os.write(1, f\"sum {total} {gang.tell('from 0' if gang.is_main else None)}\\n\".encode())\n"
+        "os.write(1, f\"sum {total} {gang.broadcast_text('from 0' if gang.is_main else None)}\\n\".encode())\n"
         "gang.close()\n"
     )
     command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2", str(script)]

@@ -126,15 +126,15 @@ MISFITS: dict[str, Any] = {
     ),
     "rewards.place.limit: expected a number, found (1.0, 2.0)": Reward(terms.joint_velocity_excess, limit=(1.0, 2.0)),
     "rewards.plce: it has no weight; give it one, such as Reward(…, weight=-1.0)": Reward(terms.alive),
-    "terminations.typo: far_away has no parameter limt; did you mean limit?": Termination(distant, limt=3.0),
-    "terminations.out: far_away needs limit=float": Termination(distant),
-    "terminations.both: far_away has no parameter limt; did you mean limit?": Termination(distant, limit=3.0, limt=3.0),
+    "terminations.typo: distant has no parameter limt; did you mean limit?": Termination(distant, limt=3.0),
+    "terminations.out: distant needs limit=float": Termination(distant),
+    "terminations.both: distant has no parameter limt; did you mean limit?": Termination(distant, limit=3.0, limt=3.0),
     "terminations.alive: alive has a parameter terminated, which there is nothing for here": Termination(terms.alive),
     "terminations.time_out: the clock's own has this name": Termination(distant, limit=1.0),
     "actions: joint first is driven by two terms": Action(terms.effort),
     "actions.force.scale: no column matches 'frst'; did you mean first?": Action(terms.effort, scale={"frst": 1.0}),
     "actions.force.scale: no pattern fits second; add one, such as '*'": Action(terms.effort, scale={"first": 1.0}),
-    "commands.target: far_away has a parameter joint, which there is nothing for here": Command(
+    "commands.target: distant has a parameter joint, which there is nothing for here": Command(
         distant, names=("a",), limit=1.0
     ),
     "events.kick: an interval needs seconds=(least, greatest), above 0": Event(distant, limit=1.0, when="interval"),

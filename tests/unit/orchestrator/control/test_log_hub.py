@@ -92,7 +92,7 @@ class World:
         self.threads[-1].start()
         return pieces
 
-    def received(self) -> None:
+    def settle(self) -> None:
         """Until the hub takes what nodes tell, which they do then."""
         wait_for(lambda: self.hub._followed and self.hub._followed["job"].logs._has_polled, what="the first look")
         self.state(max(number for number, _ in self.writers))
@@ -150,7 +150,7 @@ def test_nodes_are_asked_to_push_and_a_line_reaches_all_followers_without_a_file
     world.write("before", push=False)
     wait_for(lambda: all(has(each, "before") for each in everyone))
     wait_for(lambda: world.requested["job", 1])
-    world.received()
+    world.settle()
     looks.clear()
     for number in range(50):
         world.write(f"line {number}", (1, number % 2))
@@ -160,7 +160,7 @@ def test_nodes_are_asked_to_push_and_a_line_reaches_all_followers_without_a_file
 
 def test_a_lost_push_costs_one_look_for_all_followers(world: World, looks: Counter[str]) -> None:
     everyone = [world.follow() for _ in range(20)]
-    world.received()
+    world.settle()
     world.write("first")
     wait_for(lambda: all(has(each, "first") for each in everyone))
     looks.clear()
@@ -183,7 +183,7 @@ def test_a_supervisor_that_knows_no_pushes_any_more_is_read_and_asked_again(
     monkeypatch.setattr(log_hub, "_ASK", 0.05)
     monkeypatch.setattr(log_hub, "_ASK_SELDOM", 0.1)
     pieces = world.follow()
-    world.received()
+    world.settle()
     requested = world.requested["job", 1]
     world.bus.stated(("job", 1, 0), None, False)
     world.write("of the successor", push=False)
@@ -192,7 +192,7 @@ def test_a_supervisor_that_knows_no_pushes_any_more_is_read_and_asked_again(
 
 def test_followers_end_with_the_job_and_have_its_last_line_though_its_push_was_lost(world: World) -> None:
     everyone = [world.follow() for _ in range(5)]
-    world.received()
+    world.settle()
     world.write("seen")
     wait_for(lambda: all(has(each, "seen") for each in everyone))
     world.write("the very last", push=False)
@@ -207,7 +207,7 @@ def test_followers_end_with_the_job_and_have_its_last_line_though_its_push_was_l
 def test_followers_end_though_no_commit_told_of_the_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_hub, "_ROWS", 0.0)
     pieces = world.follow()
-    world.received()
+    world.settle()
     world.write("seen")
     wait_for(lambda: has(pieces, "seen"))
     world.database.committed = None
@@ -227,7 +227,7 @@ def test_the_follower_of_a_job_that_is_over_or_gone_ends(world: World) -> None:
 
 def test_a_new_attempt_is_taken_up_and_asked_and_the_end_of_the_former_is_not_lost(world: World) -> None:
     pieces = world.follow()
-    world.received()
+    world.settle()
     world.write("first attempt")
     wait_for(lambda: has(pieces, "first attempt"))
     world.write("its end", push=False)
@@ -235,14 +235,14 @@ def test_a_new_attempt_is_taken_up_and_asked_and_the_end_of_the_former_is_not_lo
     world.begin(2)
     world.write("second attempt", (2, 1), push=False)
     wait_for(lambda: has(pieces, "first attempt", "its end", "second attempt") and world.requested["job", 2])
-    world.received()
+    world.settle()
     world.write("pushed", (2, 0))
     wait_for(lambda: has(pieces, "pushed"))
 
 
 def test_while_the_store_is_away_lines_come_from_memory_and_nothing_is_lost(world: World) -> None:
     pieces = world.follow()
-    world.received()
+    world.settle()
     world.write("before")
     wait_for(lambda: has(pieces, "before"))
     world.problem = "there is no store"
@@ -272,7 +272,7 @@ def test_a_follower_that_takes_nothing_holds_no_other_up_and_keeps_little(world:
     waker = Waker()
     with world.hub.follow(world.run, "job", waker) as logs:  # it never reads
         pieces = world.follow()
-        world.received()
+        world.settle()
         for number in range(400):
             world.write(f"{number} " + "x" * 5000)
         world.state()
@@ -285,7 +285,7 @@ def test_all_followed_logs_share_a_bounded_memory(world: World, monkeypatch: pyt
     bound = 1 << 20
     monkeypatch.setattr(log_hub, "_MEMORY", bound)
     with world.hub.follow(world.run, "job", Waker()) as logs:
-        world.received()
+        world.settle()
         for node in range(40):
             for position in range(0, 1 << 18, 1 << 14):
                 world.bus.pushed(("job", 1, node), position, b"x" * (1 << 14))

@@ -47,7 +47,7 @@ def with_terms(state: AttemptState, **terms: Any) -> AttemptState:
     return replace(state, terms=replace(state.terms, **terms))
 
 
-def requested(state: AttemptState) -> AttemptState:
+def stopping(state: AttemptState) -> AttemptState:
     return replace(state, stop_reason="enough")
 
 
@@ -70,7 +70,7 @@ DONE = Verdict(Ending.SUCCEEDED, AWS_EXITED, 0)
 STOPPED = Verdict(Ending.STOPPED, "enough")
 FAILED = Verdict(Ending.FAILED, "main node: exit 1", 1)
 MAIN_LAST = (end(0), end(0))
-REQUESTED_LAST = (end(0, requested=True), end(0))
+LEFT_LAST = (end(0, requested=True), end(0))
 KILLED = end(143, requested=True)
 UNSURE = Verdict(Ending.FAILED, "main node: exit 143", 143, certain=False)
 QUIET = Silence(121.0, "12:00:00 UTC", False, "none is heard")
@@ -125,7 +125,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
         [do.Withdraw("away")],
     ),
     "but not while a call on the store is under way": (PREPARING, Delayed("silent"), [do.Explain("silent")]),
-    "one that is not needed takes nothing": (requested(PREPARING), Due(), [do.Decide(STOPPED), do.WindUp()]),
+    "one that is not needed takes nothing": (stopping(PREPARING), Due(), [do.Decide(STOPPED), do.WindUp()]),
     "nor one that was preempted": (ending(Ending.PREEMPTED, of=PREPARING), Due(), [do.WindUp()]),
     "the scheduler may take its place": (
         PREPARING,
@@ -135,7 +135,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     # -- launching
     "what is recorded is launched": (LAUNCHING, Due(), [do.Launch()]),
     "what is to end is not launched anew": (ending(Ending.PREEMPTED, of=LAUNCHING), Due(), [do.Launch(again=False)]),
-    "nor on request": (requested(LAUNCHING), Due(), [do.Launch(again=False)]),
+    "nor on request": (stopping(LAUNCHING), Due(), [do.Launch(again=False)]),
     "what was preempted before it could start is over": (
         ending(Ending.PREEMPTED, of=LAUNCHING),
         Delayed("pulling the image", idle=True),
@@ -145,11 +145,11 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     "a launch that waits says why": (LAUNCHING, Delayed("no room", idle=True), [do.Explain("no room")]),
     "or nothing yet": (LAUNCHING, Delayed(""), []),
     "one that is not needed is given up": (
-        requested(LAUNCHING),
+        stopping(LAUNCHING),
         Delayed("full", idle=True),
         [do.Decide(STOPPED), do.WindUp()],
     ),
-    "unless something may run": (requested(LAUNCHING), Delayed("silent"), [do.Explain("silent")]),
+    "unless something may run": (stopping(LAUNCHING), Delayed("silent"), [do.Explain("silent")]),
     "a refusal of what is to end anyway changes nothing": (
         ending(Ending.PREEMPTED, of=LAUNCHING),
         StartRefused("gone", is_final=False),
@@ -203,13 +203,13 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     ),
     "but not for ever": (replace(RUNNING, cause_since=T - CAUSE_PATIENCE - 1), seen(KILLED, None), ends(UNSURE, 5.0)),
     "nor when the job is to stop": (
-        requested(RUNNING),
+        stopping(RUNNING),
         seen(KILLED, None),
         [SAYS_SO, do.Await("cause_since", T), *decided(STOPPED)],
     ),
-    "a request ends it": (requested(RUNNING), seen(), ends(STOPPED)),
-    "also before it runs": (requested(STARTING), seen(waits="queued"), ends(STOPPED, first=do.Explain("queued"))),
-    "an end counts more than a request": (requested(RUNNING), seen(*MAIN_LAST), ends(DONE)),
+    "a request ends it": (stopping(RUNNING), seen(), ends(STOPPED)),
+    "also before it runs": (stopping(STARTING), seen(waits="queued"), ends(STOPPED, first=do.Explain("queued"))),
+    "an end counts more than a request": (stopping(RUNNING), seen(*MAIN_LAST), ends(DONE)),
     "a node that is lost ends it, with its whole grace": (
         RUNNING,
         seen(silences=(None, GONE_QUIET)),
@@ -234,7 +234,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
         [do.Explain("Slurm is away; the store is away")],
     ),
     "or nothing yet, and nothing follows from ends": (RUNNING, seen(end(1), None, unread=""), []),
-    "a request does not wait for the store": (requested(RUNNING), seen(unread=""), decided(STOPPED)),
+    "a request does not wait for the store": (stopping(RUNNING), seen(unread=""), decided(STOPPED)),
     "nor does the clock": (
         replace(TIMED, running_since=T - 50_001),
         seen(unread=""),
@@ -264,7 +264,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     "also before its launch": (LAUNCHING, Preempted("for b"), [do.Decide(Verdict(Ending.PREEMPTED, "for b"))]),
     "not twice": (ending(Ending.FAILED), Preempted("for b"), []),
     # -- how it is ended
-    "an end that is decided stays": (requested(ending(Ending.FAILED)), seen(*MAIN_LAST), stops(5.0)),
+    "an end that is decided stays": (stopping(ending(Ending.FAILED)), seen(*MAIN_LAST), stops(5.0)),
     "a preempted gang may save": (ending(Ending.PREEMPTED), seen(), stops()),
     "one that never ran is stopped, too, and its queue says no more why it waits": (
         ending(Ending.PREEMPTED, of=STARTING),
@@ -330,7 +330,7 @@ def final(code: int, condition: dict[str, str]) -> AttemptState:
 
 
 REASON_3 = {"action": "EXIT", "onReason": "exit 3"}
-PERHAPS_REQUESTED = (replace(end(0), requested=None), None)
+UNCERTAIN = (replace(end(0), requested=None), None)
 NEVER_STARTED = ending(Ending.FAILED, of=LAUNCHING)
 REFUSED_ON_AWS = replace(LAUNCHING, verdict=Verdict(Ending.FAILED, "Task failed to start", start_error="why"))
 WHY = {"action": "EXIT", "onReason": "wh*"}
@@ -356,32 +356,26 @@ REPEATED_SO = f"why ({FAULT} ended the attempt before, too: not tried again afte
 # state, the nodes' ends → whether the attempt is spent, the job's state, and its reason
 CLOSES: dict[str, tuple[AttemptState, Sequence[NodeEnd | None], bool, Status, str]] = {
     "done": (ending(Ending.SUCCEEDED), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
-    "done before the stop": (requested(ending(Ending.SUCCEEDED)), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
-    "done before its user stopped it": (requested(ending(STOP)), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
-    "stopped with 0": (requested(ending(STOP)), REQUESTED_LAST, SPENT, S.FAILED, STOPPED_SO),
-    "stopped with 0, perhaps": (requested(ending(STOP)), PERHAPS_REQUESTED, SPENT, S.FAILED, STOPPED_SO),
-    "stopped": (requested(ending(STOP)), (), SPENT, S.FAILED, STOPPED_SO),
-    "stopped, on AWS": (on_aws(requested(ending(STOP))), (), SPENT, S.FAILED, "enough"),
-    "failed when it was asked to stop": (requested(ending(Ending.FAILED)), (), SPENT, S.FAILED, STOPPED_SO),
-    "left when it was asked to stop": (requested(ending(REQUEUE)), (), FREE, S.FAILED, STOPPED_SO),
-    "preempted when it was asked to stop": (requested(ending(Ending.PREEMPTED)), MAIN_LAST, FREE, S.FAILED, STOPPED_SO),
-    "refused when it was asked to stop": (requested(ending(Ending.FATAL)), (), SPENT, S.FAILED, "why"),
-    "over time when it was asked to stop": (requested(ending(Ending.TIMEOUT)), (), SPENT, S.FAILED, "why"),
+    "done before the stop": (stopping(ending(Ending.SUCCEEDED)), MAIN_LAST, SPENT, S.SUCCEEDED, "why"),
+    "done before its user stopped it": (stopping(ending(STOP)), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "stopped with 0": (stopping(ending(STOP)), LEFT_LAST, SPENT, S.FAILED, STOPPED_SO),
+    "stopped with 0, perhaps": (stopping(ending(STOP)), UNCERTAIN, SPENT, S.FAILED, STOPPED_SO),
+    "stopped": (stopping(ending(STOP)), (), SPENT, S.FAILED, STOPPED_SO),
+    "stopped, on AWS": (on_aws(stopping(ending(STOP))), (), SPENT, S.FAILED, "enough"),
+    "failed when it was asked to stop": (stopping(ending(Ending.FAILED)), (), SPENT, S.FAILED, STOPPED_SO),
+    "left when it was asked to stop": (stopping(ending(REQUEUE)), (), FREE, S.FAILED, STOPPED_SO),
+    "preempted when it was asked to stop": (stopping(ending(Ending.PREEMPTED)), MAIN_LAST, FREE, S.FAILED, STOPPED_SO),
+    "refused when it was asked to stop": (stopping(ending(Ending.FATAL)), (), SPENT, S.FAILED, "why"),
+    "over time when it was asked to stop": (stopping(ending(Ending.TIMEOUT)), (), SPENT, S.FAILED, "why"),
     "preempted": (ending(Ending.PREEMPTED), BOTH_LEFT, FREE, S.RUNNABLE, PREEMPTED_SO),
     "preempted before its launch": (ending(Ending.PREEMPTED, of=LAUNCHING), (), FREE, S.RUNNABLE, PREEMPTED_SO),
     "done before it was stopped": (ending(Ending.LOST), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
-    "done when it was stopped": (ending(Ending.LOST), REQUESTED_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
+    "done when it was stopped": (ending(Ending.LOST), LEFT_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
     "done when a child had failed": (ending(Ending.FAILED), (end(0), end(1)), SPENT, S.SUCCEEDED, STOPPED_LATE),
     "done before it was stopped, on AWS": (on_aws(ending(Ending.LOST)), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
-    "stopped with 0, on AWS": (
-        on_aws(with_terms(ending(Ending.LOST), spent=2)),
-        REQUESTED_LAST,
-        SPENT,
-        S.FAILED,
-        "why",
-    ),
+    "stopped with 0, on AWS": (on_aws(with_terms(ending(Ending.LOST), spent=2)), LEFT_LAST, SPENT, S.FAILED, "why"),
     "done before its time was over": (ending(Ending.TIMEOUT), MAIN_LAST, SPENT, S.SUCCEEDED, STOPPED_LATE),
-    "stopped with 0 when its time was over": (ending(Ending.TIMEOUT), REQUESTED_LAST, SPENT, S.FAILED, "why"),
+    "stopped with 0 when its time was over": (ending(Ending.TIMEOUT), LEFT_LAST, SPENT, S.FAILED, "why"),
     "done before it was preempted": (ending(Ending.PREEMPTED), MAIN_LAST, FREE, S.SUCCEEDED, DONE_SO),
     "left on request": (with_terms(ran(ending(REQUEUE), LEFT), spent=3), BOTH_LEFT, FREE, S.RUNNABLE, LEFT_SO),
     "left at once": (AT_ONCE, BOTH_LEFT, SPENT, S.RUNNABLE, LEFT_SO),
@@ -400,7 +394,7 @@ CLOSES: dict[str, tuple[AttemptState, Sequence[NodeEnd | None], bool, Status, st
     "failed twice for no fault": (faulty(None, None), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
     "failed by the same fault twice, on AWS": (on_aws(faulty(FAULT)), MAIN_FAILED, SPENT, S.RUNNABLE, FAILED_SO),
     "failed by the same fault when it was asked to stop": (
-        requested(faulty(FAULT)),
+        stopping(faulty(FAULT)),
         MAIN_FAILED,
         SPENT,
         S.FAILED,
