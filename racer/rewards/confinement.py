@@ -107,7 +107,7 @@ def line_of(error: BaseException, file: str) -> int:
 def result_problem(result: Any) -> str:
     """The fault of a function's return value; empty without one.
 
-    A truth value is no reward: AWS's own check wants a float. Whole numbers and NumPy's numbers are taken as well.
+    A truth value is refused: AWS's own check wants a float. Whole numbers and NumPy's numbers are taken as well.
     """
     if result is None:
         return "it returned None; return a number on every way through the function"

@@ -79,7 +79,7 @@ def read_file(path: Path) -> str:
     """The text of a file.
 
     Raises:
-        RewardRefused: It can't be read, or is no text.
+        RewardRefused: It can't be read, or is not text.
     """
     try:
         with io.BufferedReader(io.FileIO(path), 1 << 20) as opened:
@@ -95,7 +95,7 @@ def read_file(path: Path) -> str:
         message = f"the file can't be read: {error.strerror}"
         raise RewardRefused(Problem("TEST_FAILURE", message, str(path))) from error
     except (SyntaxError, UnicodeDecodeError, LookupError) as error:
-        message = f"the file is no text: {str(error).splitlines()[0]}"
+        message = f"the file is not text: {str(error).splitlines()[0]}"
         raise RewardRefused(Problem("SYNTAX_ERROR", message, str(path))) from error
     raise RewardRefused(_too_long(count, str(path)))
 

@@ -270,7 +270,7 @@ def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.py"
     assert str(check(path)) == f"{path}: TEST_FAILURE: the file can't be read: No such file or directory"
     path.write_bytes(b"\xff\xfe\x00")
-    assert str(check(path)).startswith(f"{path}: SYNTAX_ERROR: the file is no text: ")
+    assert str(check(path)).startswith(f"{path}: SYNTAX_ERROR: the file is not text: ")
 
 
 def test_the_command_reports_errors_or_the_mode_of_execution(

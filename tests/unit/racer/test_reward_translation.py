@@ -185,7 +185,7 @@ def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dic
         ("def f():\n        return lambda: x\n    return f()()", "line 11: a function that returns a function"),
         ("return 2 ** int(x)", "line 10: an int to the power of an int that is not known"),
         ("return 1\nfrom numpy import *", "line 11: from numpy import *"),
-        ("z = {(1, [2]): 3}\n    return 1", "line 10: a dictionary whose keys are no constants"),
+        ("z = {(1, [2]): 3}\n    return 1", "line 10: a dictionary whose keys are not constant"),
         ("return pow(3, 4, 5)", "line 10: pow() with 3 arguments"),
         ("return int('101', 2)", "line 10: int() with 2 arguments"),
         ("return abs() if x > 1e9 else 1", "line 10: abs() with 0 arguments"),
