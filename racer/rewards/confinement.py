@@ -64,10 +64,6 @@ class _Hidden:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
-class Flooded(BaseException):
-    """A function printed more than :data:`MOST_PRINTED` characters in one call."""
-
-
 class Printed:
     """Takes the place of standard output: counts what is printed, and drops it."""
 

@@ -291,15 +291,8 @@ def try_out(
 
     The process may be in the hands of an attacker: its answer is bounded, and can say nothing but a fault of this function.
     """
-    root = str(Path(__file__).parents[3])
-    request = {
-        "source": source,
-        "file": file,
-        "samples": samples,
-        "seconds": SECONDS,
-        "root": root,
-        "anyway": anyway,
-    }
+    root = str(Path(__file__).parents[2])
+    request = {"source": source, "file": file, "samples": samples, "seconds": SECONDS, "root": root, "anyway": anyway}
     answer, errors, code = _answer(json.dumps(request).encode())
     lines = [line for each in answer.decode(errors="replace").splitlines() if (line := _read_line(each))]
     unconfined = next((plain(str(line["unconfined"])) for line in lines[:1] if "unconfined" in line), "")

@@ -18,7 +18,7 @@ from racer.rewards import reward as reward_module
 from racer.rewards.compiled_function import failures_of, kernels, race_arrays, warp_function
 from racer.rewards.problems import Failure, RewardRefused
 from racer.rewards.reward import RewardFunction
-from racer.rewards.samples import CentreLine, oval, random_sample, samples
+from racer.rewards.samples import oval, oval_track, random_sample, samples
 from racer.rewards.translation import Outside, Translated, translate
 from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
@@ -316,8 +316,8 @@ DRAWN = 250
 
 def tried() -> list[dict[str, Any]]:
     """Sample inputs and drawn ones, as the arrays hold them."""
-    chance, line = random.Random(16), CentreLine(oval())
-    drawn = [*samples().values(), *(random_sample(line, chance) for _ in range(DRAWN))]
+    chance = random.Random(16)
+    drawn = [*samples().values(), *(random_sample(oval_track(), chance) for _ in range(DRAWN))]
     found = []
     for params in drawn:
         numbers, objects = parameters.row_of(params)
