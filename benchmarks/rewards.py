@@ -24,7 +24,7 @@ from benchmarks.load import Watch, add_option, reported
 from benchmarks.training import CUDA, device_name
 from racer.rewards.parameters import row_of
 from racer.rewards.reward import RewardFunction
-from racer.rewards.samples import CentreLine, oval, random_sample
+from racer.rewards.samples import oval, oval_track, random_sample
 from racer.rewards.workers import Workers
 
 FUNCTIONS = {
@@ -69,10 +69,10 @@ ROUNDS, SECONDS = 5, 1.0
 
 def filled(reward: RewardFunction, cars: int) -> None:
     """Cars anywhere on the oval."""
-    chance, line = random.Random(1), CentreLine(oval())
+    chance = random.Random(1)
     numbers, objects = reward.race.numbers.numpy().copy(), reward.race.objects.numpy().copy()
     for car in range(cars):
-        params = random_sample(line, chance)
+        params = random_sample(oval_track(), chance)
         numbers[car], rows = row_of(params, track=int(params["is_reversed"]))
         objects[car, : len(rows)] = rows if rows else 0.0
     reward.race.numbers.assign(numbers)

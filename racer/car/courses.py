@@ -24,14 +24,7 @@ def courses_of(circuit: Circuit) -> tuple[Course, ...]:
         boxes = project(track, poses[:MOST_OBJECTS, :2])
         sides = zip(boxes.along.tolist(), boxes.distance.tolist(), boxes.left.tolist(), strict=True)
         objects = tuple(Placed(along, distance if left else -distance) for along, distance, left in sides)
-        widths = track.width.tolist()
-        course = Course(
-            name=track.name,
-            points=tuple((x, y) for x, y in track.line().tolist()),
-            widths=tuple([*widths, widths[0]] if track.closed else widths),
-            closed=track.closed,
-            objects=objects,
-        )
+        course = Course(track.name, objects, track.digest, of_job=track)
         found.setdefault(RANDOM if track.name.startswith(RANDOM) else track.name, course)
     return tuple(found.values())
 
@@ -59,4 +52,4 @@ def courses_for(config: Mapping[str, Any], store: Store | None) -> tuple[tuple[C
     except Refused as error:
         notes.append(f"it is tried on an oval, not on the job's tracks ({error})")
         return (FINE_OVAL,), notes
-    return (FINE_OVAL,), [*notes, f"it is tried on an oval of {len(FINE_OVAL.points) - 1} waypoints instead"]
+    return (FINE_OVAL,), [*notes, f"it is tried on an oval of {len(FINE_OVAL.track.center)} waypoints instead"]

@@ -64,10 +64,6 @@ class _Hidden:
             raise ModuleNotFoundError(f"No module named {name!r}", name=name)
 
 
-class Flooded(BaseException):
-    """A function printed more than :data:`MOST_PRINTED` characters in one call."""
-
-
 class Printed:
     """Takes the place of standard output: counts what is printed, and drops it."""
 
@@ -107,7 +103,7 @@ def line_of(error: BaseException, file: str) -> int:
 def result_problem(result: Any) -> str:
     """The fault of a function's return value; empty without one.
 
-    A truth value is no reward: AWS's own check wants a float. Whole numbers and NumPy's numbers are taken as well.
+    A truth value is refused: AWS's own check wants a float. Whole numbers and NumPy's numbers are taken as well.
     """
     if result is None:
         return "it returned None; return a number on every way through the function"

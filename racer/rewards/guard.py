@@ -79,7 +79,7 @@ def read_file(path: Path) -> str:
     """The text of a file.
 
     Raises:
-        RewardRefused: It can't be read, or is no text.
+        RewardRefused: It can't be read, or is not text.
     """
     try:
         with io.BufferedReader(io.FileIO(path), 1 << 20) as opened:
@@ -95,7 +95,7 @@ def read_file(path: Path) -> str:
         message = f"the file can't be read: {error.strerror}"
         raise RewardRefused(Problem("TEST_FAILURE", message, str(path))) from error
     except (SyntaxError, UnicodeDecodeError, LookupError) as error:
-        message = f"the file is no text: {str(error).splitlines()[0]}"
+        message = f"the file is not text: {str(error).splitlines()[0]}"
         raise RewardRefused(Problem("SYNTAX_ERROR", message, str(path))) from error
     raise RewardRefused(_too_long(count, str(path)))
 
@@ -291,15 +291,8 @@ def try_out(
 
     The process may be in the hands of an attacker: its answer is bounded, and can say nothing but a fault of this function.
     """
-    root = str(Path(__file__).parents[3])
-    request = {
-        "source": source,
-        "file": file,
-        "samples": samples,
-        "seconds": SECONDS,
-        "root": root,
-        "anyway": anyway,
-    }
+    root = str(Path(__file__).parents[2])
+    request = {"source": source, "file": file, "samples": samples, "seconds": SECONDS, "root": root, "anyway": anyway}
     answer, errors, code = _answer(json.dumps(request).encode())
     lines = [line for each in answer.decode(errors="replace").splitlines() if (line := _read_line(each))]
     unconfined = next((plain(str(line["unconfined"])) for line in lines[:1] if "unconfined" in line), "")

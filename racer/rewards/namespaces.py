@@ -170,7 +170,11 @@ class Car:
 
     def __init__(self, code: CodeType, *, draws: bool) -> None:
         self._context = contextvars.Context()  # holds what numpy.seterr and others set
-        self._state = _new_state() if draws else None
+        self._state: Any = None
+        if draws:
+            import numpy as np
+
+            self._state = np.random.RandomState().get_state(legacy=False)  # from the system's entropy
         scope: dict[str, Any] = {"__name__": "reward_function", "__builtins__": _BUILTINS, _OWN: Modules(shares=draws)}
         self._run(exec, _copied(code), scope)
         if "reward_function" not in scope:
@@ -223,13 +227,6 @@ def _imports_scipy(node: ast.AST) -> bool:
     if isinstance(node, ast.Import):
         return any(alias.name.partition(".")[0] == "scipy" for alias in node.names)
     return isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "scipy"
-
-
-def _new_state() -> Any:
-    """A state of NumPy's generator from the system's entropy."""
-    import numpy as np
-
-    return np.random.RandomState().get_state(legacy=False)
 
 
 def _import(

@@ -80,12 +80,7 @@ PARAMETERS = (
     Parameter("track_length", "float", "one", "m", "Length of the centre line", (0.0, None)),
     Parameter("track_width", "float", "one", "m", "Width of the road where the car is", (0.0, None)),
     Parameter(
-        "closest_waypoints",
-        "int",
-        "two",
-        "",
-        "Indices of the waypoints behind and in front of the car",
-        (0, None),
+        "closest_waypoints", "int", "two", "", "Indices of the waypoints behind and in front of the car", (0, None)
     ),
     Parameter(
         "closest_objects",

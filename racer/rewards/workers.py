@@ -110,7 +110,7 @@ class Workers:
             "file": file,
             "seconds": seconds,
             "memory": memory,
-            "root": str(Path(__file__).parents[3]),
+            "root": str(Path(__file__).parents[2]),
             "worlds": worlds,
             "tracks": [np.asarray(track, dtype=np.float32).tolist() for track in tracks],
             "shared": self._descriptor,

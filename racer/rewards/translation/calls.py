@@ -217,7 +217,7 @@ class Calls(Expressions):
             if default
         }
         if not is_known([*defaults.values()]):
-            raise Outside(node, "a default that is no constant")
+            raise Outside(node, "a default that is not constant")
         if found.vararg or found.kwarg or getattr(node, "decorator_list", None):
             raise Outside(node, "a decorated function, or one with * or **")
         kind: dict[ast.arg, Any] = dict.fromkeys(places, kinds.POSITIONAL_OR_KEYWORD)

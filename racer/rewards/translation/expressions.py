@@ -70,7 +70,7 @@ class Expressions(Emission):
     def _Constant(self, node: ast.Constant) -> Value:
         if not is_known(node.value) or not fits(node.value):
             raise Outside(
-                node, "a number beyond 64 bit" if isinstance(node.value, int) else "a constant that is no number"
+                node, "a number beyond 64 bit" if isinstance(node.value, int) else "a constant that is not a number"
             )
         return node.value
 
@@ -100,7 +100,7 @@ class Expressions(Emission):
     def _List(self, node: ast.List | ast.Tuple) -> Value:
         items = (list if isinstance(node, ast.List) else tuple)(map(self.expression, node.elts))
         if len(items) > LONGEST_GROUP and not is_known(items):
-            raise Outside(node, f"a list of more than {LONGEST_GROUP} items that are no constants")
+            raise Outside(node, f"a list of more than {LONGEST_GROUP} items that are not constant")
         return items
 
     _Tuple = _List
@@ -108,7 +108,7 @@ class Expressions(Emission):
     def _Dict(self, node: ast.Dict) -> Value:
         keys = [... if key is None else self.expression(key) for key in node.keys]
         if not all(map(_is_key, keys)):
-            raise Outside(node, "a dictionary whose keys are no constants")
+            raise Outside(node, "a dictionary whose keys are not constant")
         values = [self.expression(each) for each in node.values]
         if not is_known(values):
             raise Outside(node, "a dictionary that is made when it runs")

@@ -43,7 +43,7 @@ def _translate(tree: ast.Module) -> Translated:
     module = Module(tree)
     main = module.names.get("reward_function")
     if not isinstance(main, Function):
-        raise Outside(getattr(main, "line", 1), "a reward_function that is no plain function")
+        raise Outside(getattr(main, "line", 1), "a reward_function that is not a plain function")
     reward = module.apply(main, [PARAMS], {}, main.node)
     if kind_of(reward) not in ("int", "float"):
         raise Outside(main.node, f"a reward_function that returns {described(reward)}")

@@ -15,7 +15,7 @@ from racer.car.courses import courses_for, courses_of
 from racer.rewards.__main__ import main
 from racer.rewards.guard import check_source
 from racer.rewards.parameters import row_of
-from racer.rewards.samples import FINE_OVAL, CentreLine, oval, random_sample
+from racer.rewards.samples import FINE_OVAL, oval_track, random_sample
 from racer.settings.task import ObstacleConfig, RewardFile
 from racer.tracks.circuit import circuit_of
 from racer.tracks.geometry import on_road, project
@@ -126,9 +126,8 @@ def test_samples_are_what_a_car_on_the_track_sees(track: Any, boxes: tuple[Obsta
 
 @pytest.mark.parametrize("track", [RING, OVAL, open_track()], ids=["ring", "oval", "open"])
 def test_a_car_of_a_random_sample_is_at_the_place_of_the_line_that_is_nearest_to_it(track: Track) -> None:
-    (course,) = courses_of(circuit_of([track], ()))
-    line, chance = CentreLine(course.points, course.widths, course.closed), random.Random(3)
-    for params in (random_sample(line, chance) for _ in range(200)):
+    chance = random.Random(3)
+    for params in (random_sample(track, chance) for _ in range(200)):
         found = project(track, [[params["x"], params["y"]]], params["is_reversed"])
         assert params["projection_distance"] == pytest.approx(found.along[0], abs=1e-6)
         assert params["closest_waypoints"] == [found.before[0], found.after[0]]
@@ -140,7 +139,7 @@ def test_distances_and_sides_of_a_reversed_sample_are_those_in_driving_direction
     (course,) = courses_of(circuit_of([OVAL], boxes))
     params = course.trials()[0]["reversed"]
     assert params["projection_distance"] == pytest.approx(
-        OVAL.length - 3.3 * OVAL.length / CentreLine(oval()).length, abs=0.01
+        OVAL.length - 3.3 * OVAL.length / oval_track().length, abs=0.01
     )
     assert params["objects_distance"] == pytest.approx([OVAL.length - way for way in (2.0, 8.0, 15.0)], abs=0.01)
     assert params["objects_left_of_center"] == [False, True, False]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from racer.rewards.__main__ import main
 from racer.rewards.guard import check, check_source
 from racer.rewards.parameters import BY_NAME, PARAMETERS, parameters_of, row_of
 from racer.rewards.problems import KINDS
-from racer.rewards.samples import CentreLine, oval, samples
+from racer.rewards.samples import oval_track, samples
 from racer.rewards.translation import translate
+from racer.tracks.geometry import place_at
 from tests.conftest import REPOSITORY
 from tests.support.racer.racing import round_the_guard
 
@@ -270,7 +272,7 @@ def test_a_file_that_is_not_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "r.py"
     assert str(check(path)) == f"{path}: TEST_FAILURE: the file can't be read: No such file or directory"
     path.write_bytes(b"\xff\xfe\x00")
-    assert str(check(path)).startswith(f"{path}: SYNTAX_ERROR: the file is no text: ")
+    assert str(check(path)).startswith(f"{path}: SYNTAX_ERROR: the file is not text: ")
 
 
 def test_the_command_reports_errors_or_the_mode_of_execution(
@@ -299,14 +301,14 @@ def test_the_command_reports_errors_or_the_mode_of_execution(
 
 
 def test_the_samples_are_what_a_car_on_the_oval_sees() -> None:
-    line, found = CentreLine(oval()), samples()
-    assert line.points[0] == line.points[-1] and abs(line.length - (8.0 + 3.2 * 3.14159)) < 0.02
+    found = samples()
     straight = found["straight"]
-    # 1.5 m along the lower straight, which begins at (-2, -1.6); 0.21 m to the left of it; turned by 8 degrees to the right
-    assert (round(straight["x"], 2), round(straight["y"], 2), round(straight["heading"], 2)) == (-0.5, -1.39, -8.0)
+    # 1.5 m along the lower straight, from its middle at (0, -1.757); 0.21 m to the left of it; turned by 8 degrees to the right
+    assert (round(straight["x"], 2), round(straight["y"], 2), round(straight["heading"], 2)) == (1.5, -1.55, -8.0)
     assert straight["is_left_of_center"] and straight["all_wheels_on_track"] and not straight["objects_location"]
     assert found["off-track"]["is_offtrack"] and not found["off-track"]["all_wheels_on_track"]
-    assert abs(found["reversed"]["heading"] - -175.0) < 0.01 and found["reversed"]["is_reversed"]
+    direction = math.degrees(place_at(oval_track(), [3.3])[1][0])
+    assert abs(found["reversed"]["heading"] - (direction - 175.0)) < 0.01 and found["reversed"]["is_reversed"]
     # the boxes are at 7, 11 and 15.5 m; the car at 6.4 m
     assert found["objects"]["closest_objects"] == [2, 0]
     for params in found.values():

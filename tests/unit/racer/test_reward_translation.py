@@ -18,7 +18,7 @@ from racer.rewards import reward as reward_module
 from racer.rewards.compiled_function import failures_of, kernels, race_arrays, warp_function
 from racer.rewards.problems import Failure, RewardRefused
 from racer.rewards.reward import RewardFunction
-from racer.rewards.samples import CentreLine, oval, random_sample, samples
+from racer.rewards.samples import oval, oval_track, random_sample, samples
 from racer.rewards.translation import Outside, Translated, translate
 from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
@@ -185,7 +185,7 @@ def test_an_error_names_line_and_kind_and_is_counted_for_each_call(compiled: dic
         ("def f():\n        return lambda: x\n    return f()()", "line 11: a function that returns a function"),
         ("return 2 ** int(x)", "line 10: an int to the power of an int that is not known"),
         ("return 1\nfrom numpy import *", "line 11: from numpy import *"),
-        ("z = {(1, [2]): 3}\n    return 1", "line 10: a dictionary whose keys are no constants"),
+        ("z = {(1, [2]): 3}\n    return 1", "line 10: a dictionary whose keys are not constant"),
         ("return pow(3, 4, 5)", "line 10: pow() with 3 arguments"),
         ("return int('101', 2)", "line 10: int() with 2 arguments"),
         ("return abs() if x > 1e9 else 1", "line 10: abs() with 0 arguments"),
@@ -316,8 +316,8 @@ DRAWN = 250
 
 def tried() -> list[dict[str, Any]]:
     """Sample inputs and drawn ones, as the arrays hold them."""
-    chance, line = random.Random(16), CentreLine(oval())
-    drawn = [*samples().values(), *(random_sample(line, chance) for _ in range(DRAWN))]
+    chance = random.Random(16)
+    drawn = [*samples().values(), *(random_sample(oval_track(), chance) for _ in range(DRAWN))]
     found = []
     for params in drawn:
         numbers, objects = parameters.row_of(params)
