@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import importlib.util
 import json
 import os
 import re
@@ -157,20 +155,6 @@ def test_ranks_have_exactly_the_environment_that_torchrun_gives(node: Nodes) -> 
             "GLOO_SOCKET_IFNAME": "lo",
         }
         assert (found["MASTER_ADDR"], found["MASTER_PORT"]) == ("127.0.0.1", "29500")
-
-
-def test_no_variable_of_the_installed_torchrun_is_missing(node: Nodes) -> None:
-    torch = importlib.util.find_spec("torch")
-    if torch is None or torch.submodule_search_locations is None:
-        pytest.skip("torch is not installed")
-    agent = Path(torch.submodule_search_locations[0]) / "distributed/elastic/agent/server/local_elastic_agent.py"
-    assignments = [each for each in ast.walk(ast.parse(agent.read_text())) if isinstance(each, ast.Assign)]
-    dicts = [each for each in assignments if isinstance(each.value, ast.Dict)]
-    [literal] = [each.value for each in dicts if ast.unparse(each.targets[0]) == "worker_env"]
-    names = {ast.literal_eval(key) for key in literal.keys if key} | {"LOCAL_RANK", "TORCHELASTIC_ERROR_FILE"}
-    assert "RANK" in names
-    [found] = environment_of_ranks(node())
-    assert names - found.keys() == set()
 
 
 def test_variables_of_the_user_are_kept_except_those_of_the_ranks_placement(node: Nodes) -> None:

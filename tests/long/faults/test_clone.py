@@ -248,8 +248,3 @@ def test_weights_that_are_damaged_or_gone_are_refused(store: Path, harm: str) ->
         UserError, match=f"run clone can't begin with the weights of ppo@4: .*{message}.*clone it again"
     ):
         begin(store, MUSTER_PARENT="ppo@4")
-
-
-def test_a_run_that_is_no_clone_begins_with_new_weights(store: Path) -> None:
-    started = runner(training(store, run="plain"))
-    assert started.adopted is None and "starting from new weights" in started._beginning()

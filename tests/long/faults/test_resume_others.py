@@ -259,14 +259,6 @@ def test_a_setting_of_curiosity_that_is_accepted_is_what_it_uses(store: Path, ke
         assert curiosity.weight_scheduler is not None or curiosity.weight_scheduler_params is not None
 
 
-@pytest.mark.parametrize(
-    "name", sorted(SET_BY_MUSTER - {"self", "kwargs", "storage", "actor", "critic", "student", "teacher"})
-)
-def test_what_muster_gives_an_algorithm_of_rsl_rl_is_no_setting(store: Path, name: str) -> None:
-    with pytest.raises(UserError, match=rf"rsl_rl\.algorithm\.{name}: there is no such key"):
-        go_on(store, "rsl", with_value(PPO_RUN, f"algorithm.{name}", "cpu"))
-
-
 # -- one's own --------------------------------------------------------------------------------------------------------
 
 

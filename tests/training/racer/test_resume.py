@@ -16,6 +16,7 @@ SETTINGS: Settings = {
         "alternate_direction": True,
         "speed_factor": [0.8, 1.2],
         "obstacles": [{"distance": 3.0}],
+        "continuous": True,
         "randomize": {"action_latency": 2},
     },
     "RacerPixels": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24, "frames": 2}},

@@ -30,6 +30,7 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
     assert done.returncode == 0, done.stdout + done.stderr
     assert "of the bundle" in done.stdout and f"bundle:      {output} (9 files" in done.stdout, done.stdout
     assert verify(output)["iteration"] == 2
+    assert json.loads((output / "contract.json").read_text()) == json.loads(run.contract.read_text())
     report = json.loads((output / "report.json").read_text())
     assert report["judged"]["episodes"] == 4 and report["parity"]["observations"]["rollout"] >= 1000
     assert (output / "robot" / "cartpole.xml").exists()

@@ -151,14 +151,6 @@ def test_crossing_the_start_line_counts_as_progress() -> None:
     np.testing.assert_allclose(advance(track, [15.9, 0.2, 3.0, 5.0], [0.2, 15.9, 3.5, 4.0]), [0.3, -0.3, 0.5, -1.0])
 
 
-def test_many_points_at_once_give_the_same_results_as_one() -> None:
-    track = make_preset("oval", spacing=0.02)  # 1,000 waypoints: three blocks
-    points = np.random.default_rng(1).uniform(-4, 4, (2500, 2))
-    whole, one = project(track, points), project(track, points[2345])
-    assert (whole.along[2345], whole.before[2345]) == (one.along[0], one.before[0])
-    assert on_road(track, points)[2345] == on_road(track, points[2345])[0]
-
-
 TRACKS = [make_preset("oval"), make_random(3), make_preset("chicane", direction=CLOCKWISE, width=1.3), open_track()]
 
 

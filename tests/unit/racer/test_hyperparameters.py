@@ -53,13 +53,6 @@ def test_a_usual_file_becomes_settings_of_ppo() -> None:
     assert output.keys() == {f"hyperparameters.{name}" for name in unused | close}
 
 
-def test_a_usual_file_becomes_settings_of_sac() -> None:
-    spec = job(USUAL, algorithm="sac")
-    assert spec.train is not None
-    rates = dict.fromkeys(("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate"), 0.0003)
-    assert spec.train.overrides() == {"batch_size": 64, "gamma": 0.99, "init_temperature": 0.2, **rates}
-
-
 OF_SAC = {
     **{"lr": 0.0003, "discount_factor": 0.999, "batch_size": 64, "loss_type": "mean squared error"},
     **{"exploration_type": "additive_noise", "sac_alpha": 0.2},

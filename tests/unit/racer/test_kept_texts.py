@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from racer.rewards.reward_file import RewardFile, reward_file
-from shared_store.volume import texts
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import digest_of
 from tests.support.refusals import refusal
@@ -25,14 +24,6 @@ def environment(store: Path, kind: str) -> dict[str, str]:
     section: dict[str, Any] = {"task": "Racer", "config": {"track": "oval", "reward_function": REFERENCE}}
     spec = {"name": "line", kind: section}
     return {"MUSTER_STORE": str(store), "MUSTER_RUN": "line", "MUSTER_EPOCH": "1", "MUSTER_SPEC": json.dumps(spec)}
-
-
-@pytest.mark.parametrize("kind", ["train", "evaluate", "race"])
-def test_a_rank_has_the_text_and_its_spec_the_digest(tmp_path: Path, kind: str) -> None:
-    texts.keep(Store(tmp_path).run("line").texts, TEXT.encode())
-    job = Job.from_env(environment(tmp_path, kind), kind)
-    assert job.section["config"] == {"track": "oval", "reward_function": {"file": "mine.py", "text": TEXT}}
-    assert job.spec[kind]["config"]["reward_function"] == REFERENCE
 
 
 def test_a_rank_refuses_a_text_that_is_missing_or_altered(tmp_path: Path) -> None:

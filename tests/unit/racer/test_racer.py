@@ -13,10 +13,7 @@ import torch
 from orchestrator.spec.model import validate
 from racer.car.task import Racer, RacerPixels, RacerPixelsAndState
 from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from racer.tracks.generator import make_random
 from racer.tracks.geometry import on_road, place_at
-from racer.tracks.naming import keep
-from shared_store.volume.layout import Store
 from tests.support.racer.racing import OVAL, counted, known, racer, straight
 from tests.support.refusals import refusal
 from worker.learning.job import configure
@@ -271,16 +268,6 @@ def test_errors_that_only_a_rank_can_see_are_refused_in_one_line(tmp_path: Any) 
     (tmp_path / "model_metadata.json").write_text('{"action_space": [')
     with pytest.raises(ValueError, match="it is not JSON"):
         RacerConfig(action_space=str(tmp_path / "model_metadata.json")).actions()
-
-
-def test_a_track_of_the_store_is_found_by_the_ranks_of_a_job(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    hills = make_random(5, "hills")
-    keep(Store(tmp_path), hills, {"seed": 5})
-    with pytest.raises(ValueError, match=r"config.track: track 'hills': there is no such track"):
-        Racer.sketch(RacerConfig(track=("oval", "hills")))
-    monkeypatch.setenv("MUSTER_STORE", str(tmp_path))
-    circuit = Racer.sketch(RacerConfig(track=("oval", "hills"))).circuit
-    assert [track.digest for track in circuit.tracks] == [OVAL.digest, hills.digest]
 
 
 def test_a_metadata_file_is_equal_to_its_content_in_the_configuration(tmp_path: Any) -> None:

@@ -207,26 +207,6 @@ def test_loading_only_weights_leaves_the_optimizer_unchanged() -> None:
     assert fresh.algorithm.learning_rate == 2e-4 and fresh.learning_rate == 2e-4
 
 
-def test_counts_of_steps_come_to_the_host() -> None:
-    trained, task = made("nothing")
-    train(trained, task, 1)
-    state = copy.deepcopy(dict(trained.state_dict()))
-    fresh, _ = made("nothing")
-    for each in state["optimizer_state_dict"]["state"].values():
-        assert each["step"].device.type == "cpu"
-        each["step"] = Elsewhere(each["step"])
-    fresh.load_state_dict(state)
-    kept = fresh.algorithm.optimizer.state.values()
-    assert kept and all(type(each["step"]) is torch.Tensor for each in kept)
-
-
-class Elsewhere(torch.Tensor):
-    """Stands for a tensor on a GPU."""
-
-    def cpu(self) -> torch.Tensor:
-        return self.as_subclass(torch.Tensor).clone()
-
-
 def test_a_teacher_has_the_weights_of_a_run_of_ppo_and_must_fit_it() -> None:
     teaching, task = made("GRU")
     train(teaching, task, 1)

@@ -21,7 +21,6 @@ from tests.conftest import REPOSITORY
 from worker import track
 from worker.learning.job import Job
 from worker.telemetry.services import Service, TrainingEnd
-from worker.telemetry.tracking_processes import Tracking
 from worker.track import Sender, SenderLock
 
 TRAIN = {"task": "Cartpole", "ppo": {"learning_rate": 0.001}}
@@ -198,12 +197,6 @@ def test_a_records_numbers_have_the_names_that_tensorboard_shows() -> None:
 def job(run: Run, **requested: Any) -> Job:
     raise_epoch(run, 1)
     return Job({"train": TRAIN, "track": requested}, Store(run.path.parent.parent), run, 1, 1, "id", section=TRAIN)
-
-
-def test_another_rank_than_the_main_one_tracks_nothing(run: Run) -> None:
-    with Tracking(job(run, wandb={}), is_main=False) as tracking:
-        tracking.check()
-        assert tracking._services == []
 
 
 @pytest.mark.parametrize(
