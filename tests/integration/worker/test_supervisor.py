@@ -56,7 +56,7 @@ def test_a_line_of_any_length_is_kept_whole_or_cut_but_never_lost(node: Nodes) -
 
 
 @pytest.mark.parametrize("locale", ["C.UTF-8", "C", "POSIX"])
-def test_bytes_that_are_no_text_are_replaced_and_of_a_progress_bar_the_last_state_is_kept(
+def test_bytes_other_than_text_are_replaced_and_of_a_progress_bar_the_last_state_is_kept(
     node: Nodes, locale: str
 ) -> None:
     n = node()
@@ -65,7 +65,7 @@ def test_bytes_that_are_no_text_are_replaced_and_of_a_progress_bar_the_last_stat
     assert n.output() == ["a\ufffd\ufffdb", "grün", "\0", "30%", "windows", "60%"]
 
 
-def test_a_log_that_can_not_be_written_does_not_stop_the_ranks(node: Nodes) -> None:
+def test_a_log_that_cannot_be_written_does_not_stop_the_ranks(node: Nodes) -> None:
     n = node()
     with full_volume(n.run.log("job", 1, 0).parent):
         assert n.python("for _ in range(5000): print('x' * 100)\nraise SystemExit(5)") == 5
@@ -174,7 +174,7 @@ def test_a_rank_that_reads_its_standard_input_finds_it_at_its_end(node: Nodes) -
 @pytest.mark.parametrize(
     ("command", "problem"), [("no-such-program", "No such file or directory"), ("/tmp", "Permission denied")]
 )
-def test_a_command_that_can_not_be_started_is_reported_with_a_remedy(node: Nodes, command: str, problem: str) -> None:
+def test_a_command_that_cannot_be_started_is_reported_with_a_remedy(node: Nodes, command: str, problem: str) -> None:
     n = node(ranks_per_node=2)
     assert n.call(command, "argument") == 127
     reason = f"can't start {command!r}: {problem}; is it installed, and is the path right?"

@@ -236,7 +236,7 @@ def test_weights_that_are_damaged_or_gone_are_refused(store: Path, harm: str) ->
         data = bytearray(weights.read_bytes())
         data[-1] ^= 1
         weights.write_bytes(data)
-    else:  # somebody deleted the run while its job waited; the controller then made a new one
+    else:  # someone deleted the run while its job waited; the controller then made a new one
         shutil.rmtree(run.path)
         run.path.mkdir()
     message = {

@@ -1,4 +1,4 @@
-"""Every setting of ``sac``, ``rsl_rl`` and an algorithm of one's own is applied to what a resumed run's learner uses, or refused by name."""
+"""Every setting of ``sac``, ``rsl_rl`` and a custom algorithm is applied to what a resumed run's learner uses, or refused by name."""
 
 from __future__ import annotations
 

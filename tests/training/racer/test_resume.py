@@ -22,7 +22,7 @@ SETTINGS: Settings = {
     "RacerPixels": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24, "frames": 2}},
     "RacerPixelsAndState": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24}},
 }
-"""Episodes are short, so that there are resets before and after each point."""
+"""Episodes are short, for resets before and after each point."""
 
 
 def test_a_fresh_process_goes_on_bit_for_bit(tmp_path: Path) -> None:

@@ -115,7 +115,7 @@ def test_a_missing_main_rank_is_named() -> None:
 MAIN_RANK_ENDED = "error: the main rank ended or did not answer in time; its log gives the reason"
 
 
-def test_ranks_whose_main_rank_ends_at_the_resume_say_so_in_one_line(tmp_path: Path) -> None:
+def test_ranks_whose_main_rank_ends_at_the_resume_report_it_in_one_line(tmp_path: Path) -> None:
     raise_epoch(Store(tmp_path).run("run"), 2)
     (main, _, reason), (other, _, errors) = run_ranks("train", 2, training(tmp_path, epoch=1))
     assert main == other == 1 and "now belongs to epoch 2" in reason
@@ -132,7 +132,7 @@ def end_while_building() -> int:
     return 0
 
 
-def test_a_rank_whose_main_rank_ends_while_it_builds_says_so_in_one_line() -> None:
+def test_a_rank_whose_main_rank_ends_while_it_builds_reports_it_in_one_line() -> None:
     _, (code, _, errors) = run_ranks("training.worker.test_distributed:end_while_building", 2)
     assert code == 1 and MAIN_RANK_ENDED in errors
     assert "Traceback" not in errors

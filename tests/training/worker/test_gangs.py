@@ -40,7 +40,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def played(store: Path) -> Played:
-    """What each rank said of each case, by its name."""
+    """What each rank returned from each case, by its name."""
     return play_cases("training.worker.test_gangs", training(store))
 
 

@@ -183,7 +183,7 @@ def test_a_length_that_leads_to_another_sound_record_hides_none(whole: Path, tmp
     assert kept == before and "nothing is known to be lost" in losses
 
 
-def test_what_can_not_be_counted_is_an_unknown_number(whole: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_counted_is_an_unknown_number(whole: Path, tmp_path: Path) -> None:
     data = whole.read_bytes()
     (start, _), (end, _) = chunks_of(whole)[3:5]
     losses, _ = kept_of(data[:start] + bytes(end - start) + data[end:], tmp_path)
@@ -225,7 +225,7 @@ def test_a_recording_without_its_meshes_is_recovered_and_the_view_says_that_it_c
         Replay(tmp_path / "f.mcap")
 
 
-def test_a_cut_anywhere_keeps_all_whole_chunks_and_is_no_damage(whole: Path, tmp_path: Path) -> None:
+def test_a_cut_anywhere_keeps_all_whole_chunks_and_does_not_count_as_damage(whole: Path, tmp_path: Path) -> None:
     data, original = whole.read_bytes(), messages_of(whole)
     chunks, chance = chunks_of(whole), random.Random(3)
     for _ in range(20):

@@ -279,7 +279,7 @@ def test_a_training_reports_its_phases_in_their_order(tmp_path: Path, monkeypatc
     assert phases == [Phase.BUILDING, Phase.TRAINING, 1, 2, *at_the_end]
 
 
-def test_a_cache_without_the_task_s_kernels_is_told_as_their_compilation(
+def test_a_cache_without_the_task_s_kernels_is_reported_as_their_compilation(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read, write = os.pipe()

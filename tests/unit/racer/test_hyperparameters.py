@@ -1,4 +1,4 @@
-"""DeepRacer's hyperparameters in a job's YAML: which settings they become, what is said of them, and what is refused."""
+"""DeepRacer's hyperparameters in a job's YAML: which settings they become, the notes on them, and what is refused."""
 
 from __future__ import annotations
 

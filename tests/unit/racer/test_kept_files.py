@@ -106,7 +106,7 @@ def test_an_error_in_a_file_is_reported_at_the_line_that_names_it(directory: Pat
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_a_text_that_does_not_fit_into_a_definition_is_kept_beside_the_job_and_the_submitter_is_told(
+def test_a_text_that_does_not_fit_into_a_definition_is_kept_beside_the_job_with_a_note_for_the_submitter(
     directory: Path,
 ) -> None:
     (directory / "mine.py").write_text(GOOD + "#" * (IN_DEFINITION - 2000))

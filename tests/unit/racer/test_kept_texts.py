@@ -37,7 +37,7 @@ def test_a_rank_refuses_a_text_that_is_missing_or_altered(tmp_path: Path) -> Non
     assert found == f"{begins}altered: its content has another digest; submit the job again with the file"
 
 
-def test_a_digest_alone_is_no_reward_function_that_could_be_run() -> None:
+def test_a_digest_alone_is_not_a_reward_function_that_could_be_run() -> None:
     with pytest.raises(
         Refused, match=r"mine\.py: its text, with sha256 .*, is kept beside a job; name the file itself"
     ):

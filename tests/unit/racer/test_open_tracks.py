@@ -82,7 +82,7 @@ def test_an_open_track_comes_back_from_its_file_with_its_borders_the_right_way()
     assert twice.track.digest == HORSESHOE.digest and twice.notes[1].startswith("left out 80 rows")
 
 
-def test_a_loop_of_which_the_last_rows_are_missing_is_no_open_track() -> None:
+def test_a_loop_of_which_the_last_rows_are_missing_is_not_an_open_track() -> None:
     words = refusal(from_bytes, file(OVAL.rows()[:-4]), "x", error=BadTrack)
     assert (
         words.startswith("the centre line is open: 0.6") and "the last row of a loop has to be the first one" in words
@@ -94,7 +94,7 @@ def test_a_loop_of_which_the_last_rows_are_missing_is_no_open_track() -> None:
     assert "has its inner border on the left" in refusal(Track, "x", **sides, closed=False, error=BadTrack)
 
 
-def test_a_coarse_loop_without_its_closing_row_is_no_open_track() -> None:
+def test_a_coarse_loop_without_its_closing_row_is_not_an_open_track() -> None:
     turn = 2 * np.pi * np.arange(24) / 24
     ring = np.stack((np.cos(turn), np.sin(turn)), -1)
     rows = np.hstack((4.0 * ring, 3.7 * ring, 4.3 * ring))  # its steps are longer than its road is wide

@@ -47,7 +47,7 @@ class Driver:
 
 
 def drive(gain: float = 1.0, learns: bool = False, **section: Any) -> tuple[Racer, Episodes, RaceTrials]:
-    """The race that a job with this ``race`` section is, of a driver that goes as told."""
+    """The race that a job with this ``race`` section is, of a driver with this behaviour."""
     changes = race_changes({"track": "oval", **section})
     task = Racer(configured(RacerConfig, {"track": "chicane", **changes}), section.get("trials", 3), seed=5)
     laps = Laps(task)

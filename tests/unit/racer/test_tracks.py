@@ -120,7 +120,7 @@ def test_a_drawn_track_has_the_requested_measures() -> None:
         ({"length": 8.0, "roughness": 1.0}, "seed 1: none of 200 curves fits"),
     ],
 )
-def test_a_track_that_can_not_be_drawn_is_refused_in_one_line(measures: dict[str, object], words: str) -> None:
+def test_a_track_that_cannot_be_drawn_is_refused_in_one_line(measures: dict[str, object], words: str) -> None:
     assert words in refusal(make_random, 1, error=BadTrack, **measures)
 
 
@@ -173,7 +173,7 @@ def changed(name: str, row: int, x: float, y: float) -> dict[str, np.ndarray]:
         ({**parts(), "outer": ring(2.1)}, "the outer border does not enclose the centre line: row 0"),
     ],
 )  # fmt: skip
-def test_rings_that_are_no_track_are_refused_with_row_and_place(rings: dict[str, np.ndarray], words: str) -> None:
+def test_rings_other_than_a_track_are_refused_with_row_and_place(rings: dict[str, np.ndarray], words: str) -> None:
     assert words in refusal(Track, "bad", **rings, error=BadTrack)
 
 
@@ -183,7 +183,7 @@ def test_a_hairpin_may_turn_about_one_point_of_its_inner_border() -> None:
     assert Track("hairpin", **rings).length > 18
 
 
-def test_the_arrays_of_a_track_are_its_own_and_can_not_be_written() -> None:
+def test_the_arrays_of_a_track_are_its_own_and_cannot_be_written() -> None:
     rings = parts()
     track = Track("circle", **rings)
     rings["center"][0] = 0

@@ -57,7 +57,9 @@ def test_the_installed_algorithms_satisfy_the_protocol(name: str) -> None:
 
 def test_an_incomplete_algorithm_is_refused_with_its_missing_members() -> None:
     lacks = "begin, act, record, load_state_dict, world_state, load_world_state, build_policy"
-    with pytest.raises(UserError, match=rf"^train.algorithm: {HERE}:OnlyLearns is no algorithm: it lacks {lacks} \("):
+    with pytest.raises(
+        UserError, match=rf"^train.algorithm: {HERE}:OnlyLearns is not an algorithm: it lacks {lacks} \("
+    ):
         find_algorithm(f"{HERE}:OnlyLearns")
 
 
@@ -90,7 +92,7 @@ def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
 
 def test_attributes_set_in_the_constructor_are_checked_before_the_first_iteration() -> None:
     chosen = find_algorithm(f"{HERE}:Forgetful")
-    with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is no algorithm: it lacks steps \("):
+    with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is not an algorithm: it lacks steps \("):
         build_algorithm(chosen, None, Point(PointConfig(), 2), WorldShare(0, 2, 2), alone(), 0)
 
 
@@ -123,7 +125,7 @@ def test_an_invalid_section_of_the_spec_is_refused_too() -> None:
 
 
 @pytest.mark.parametrize("name", [":X", "my_module:", "", "pp", "a b:C", ".:C"])
-def test_a_name_of_no_algorithm_is_refused_with_those_that_there_are(name: str) -> None:
+def test_a_name_of_no_algorithm_is_refused_with_the_known_ones(name: str) -> None:
     assert refusal(find_algorithm, name, error=UserError) == (
         f"train.algorithm: no algorithm is called {name!r}; known: ppo, rsl_rl, sac, and module:Class of your own"
     )

@@ -132,7 +132,7 @@ BUSY = "while :; do :; done"
 
 def test_a_machine_on_which_others_work_is_refused_or_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(load, "WATCHED", 0.5)
-    started = f"timeout 60 sh -c '{BUSY}' >/dev/null & echo $!"  # its parent ends: it is no child of this process
+    started = f"timeout 60 sh -c '{BUSY}' >/dev/null & echo $!"  # its parent ends: it is not a child of this process
     other = int(subprocess.run(["sh", "-c", started], stdout=subprocess.PIPE, text=True, check=True).stdout)
     try:
         with pytest.raises(SystemExit, match=r"the machine is loaded: other processes used \d+ % .*--loaded-anyway"):

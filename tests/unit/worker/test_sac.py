@@ -34,7 +34,7 @@ torch.set_num_threads(1)
         ({"v_min": 20.0}, "v_min: expected less than v_max"),
     ],
 )
-def test_settings_that_can_not_be_are_refused_by_name(settings: dict[str, Any], named: str) -> None:
+def test_settings_that_cannot_be_are_refused_by_name(settings: dict[str, Any], named: str) -> None:
     with pytest.raises(ValueError, match=named):
         SACConfig(**settings)
 

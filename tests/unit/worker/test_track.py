@@ -204,7 +204,7 @@ def job(run: Run, **requested: Any) -> Job:
     [
         (["RUN"], "error: usage: python -m worker.track RUN_DIRECTORY wandb|mlflow"),
         (["RUN", "neptune"], "error: no service is called neptune; there are: wandb, mlflow"),
-        (["nowhere", "wandb"], "nowhere is no run that a `train` job made; name a directory of runs/ in the store"),
+        (["nowhere", "wandb"], "nowhere is not a run that a `train` job made; name a directory of runs/ in the store"),
     ],
 )
 def test_a_run_that_cannot_be_sent_afterwards_is_reported_in_one_line(
