@@ -76,10 +76,7 @@ def test_an_evaluation_that_is_asked_to_stop_leaves_with_75_and_records_nothing(
     ("section", "message"),
     [
         ({"episodes": 0}, "episodes: expected an integer of at least 1, got 0"),
-        (
-            {"config": {"angle_limt": 1.0}},
-            "evaluate.config.angle_limt: CartpoleConfig has no such key; did you mean angle_limit?",
-        ),
+        ({"config": {"angle_limt": 1.0}}, "evaluate.config.angle_limt: CartpoleConfig has no such key; did you mean"),
     ],
 )
 def test_what_came_without_a_check_at_submission_is_refused_in_one_line(run: Run, section: Any, message: str) -> None:

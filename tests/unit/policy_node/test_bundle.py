@@ -69,10 +69,7 @@ def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: 
         (lambda path: (path / "policy.onnx").write_bytes(b"x"), "policy.onnx has 1 bytes"),
         (lambda path: (path / "policy.onnx").unlink(), "policy.onnx is missing; copy the bundle once more"),
         (lambda path: (path / "more.py").write_text("x"), "more.py was added, manifest.json does not list it"),
-        (
-            lambda path: (path / "manifest.json").unlink(),
-            "manifest.json is missing; name a bundle that `muster export` made",
-        ),
+        (lambda path: (path / "manifest.json").unlink(), "manifest.json is missing; name a bundle"),
         (lambda path: (path / "manifest.json").write_text("[]"), "manifest.json is not a bundle's manifest"),
         (
             lambda path: (path / "manifest.json").write_text(

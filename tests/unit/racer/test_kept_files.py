@@ -162,10 +162,7 @@ def test_a_digest_stands_for_a_text_and_never_beside_one() -> None:
         (b"{\n 1", r"space\.json:2: it is not JSON \(Expecting property name"),
         (b"\xff\xfe", r"space\.json: it is not a text file \(UTF-8\)"),
         (b'"other.json"', r"space\.json: expected a list or an object, found a string"),
-        (
-            b'{"action_space": [{"steering_angle": 0, "speed": "fast"}, {}]}',
-            r"action_space\.action_space\.0\.speed: expected a number",
-        ),
+        (b'{"action_space": [{"steering_angle": 0, "speed": "fast"}, {}]}', r"action_space\.0\.speed: expected"),
     ],
 )
 def test_an_action_space_is_checked_when_its_file_is_read(directory: Path, content: bytes, output: str) -> None:

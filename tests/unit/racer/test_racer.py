@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -268,12 +267,6 @@ def test_errors_that_only_a_rank_can_see_are_refused_in_one_line(tmp_path: Any) 
     (tmp_path / "model_metadata.json").write_text('{"action_space": [')
     with pytest.raises(ValueError, match="it is not JSON"):
         RacerConfig(action_space=str(tmp_path / "model_metadata.json")).actions()
-
-
-def test_a_metadata_file_is_equal_to_its_content_in_the_configuration(tmp_path: Any) -> None:
-    file = tmp_path / "model_metadata.json"
-    file.write_text(json.dumps(DISCRETE))
-    assert RacerConfig(action_space=str(file)).actions() == RacerConfig(action_space=DISCRETE).actions()
 
 
 def test_a_camera_sees_grass_asphalt_border_and_boxes_and_every_world_its_own() -> None:

@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
 
 from racer.store.tracks import LARGEST
 from racer.tracks.checks import BadTrack, area_of, inside
 from racer.tracks.generator import make_random
 from racer.tracks.geometry import on_road
 from racer.tracks.naming import keep, resolve
-from racer.tracks.picture import picture_of
 from racer.tracks.presets import PRESETS, make_preset
 from racer.tracks.race_track import CLOCKWISE, COUNTER_CLOCKWISE, Track
 from racer.tracks.route_file import from_bytes, read_file, to_bytes
@@ -233,15 +231,6 @@ def test_a_name_means_a_preset_a_seed_or_a_track_of_the_store(store: Store) -> N
 def test_a_name_that_means_nothing_is_refused_with_the_nearest_one(store: Store, name: str, words: str) -> None:
     keep(store, make_preset("oval", "hills"), {})
     assert words in refusal(resolve, name, store, error=BadTrack)
-
-
-def test_a_picture_has_the_shape_of_its_track() -> None:
-    long, tall = (Image.open(io.BytesIO(picture_of(make_preset(name)))) for name in ("chicane", "oval"))
-    assert long.format == "PNG" and long.width > 1.4 * long.height
-    assert tall.width / tall.height < long.width / long.height
-    colours = {tuple(pixel) for _, pixel in long.convert("RGB").getcolors(1 << 20)}
-    for drawn in ((0xD9, 0xDC, 0xE1), (0xC0, 0x20, 0x2A)):  # asphalt, start line
-        assert min(sum(abs(a - b) for a, b in zip(drawn, each, strict=True)) for each in colours) < 24, drawn
 
 
 OVAL = make_preset("oval")

@@ -143,10 +143,7 @@ NORMALISED = {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN}
         ({"obs_groups": {"actor": ["polcy"]}}, r"obs_groups: Observation 'polcy' in observation set 'actor' not found"),
         ({**CASES["shared convolutions"], "actor": NORMALISED}, r"actor\.obs_normalization: it sees images alone"),
         ({"critic": GRU, **mirrored()}, r"algorithm: Symmetry augmentation is not supported for recurrent"),
-        (
-            mirrored("tests.unit.worker.test_rsl_rl:turn"),
-            r".*data_augmentation_func: turn is called with env, obs and ",
-        ),
+        (mirrored("tests.unit.worker.test_rsl_rl:turn"), r".*data_augmentation_func: turn is called with env, obs"),
         ({**own(), **TAUGHT}, r"teacher_checkpoint: .*:OwnPPO has no teacher"),
         ({**own("Distillation", gradient_length=9), **TAUGHT}, SHORT),
         ({"torch_compile_mode": "reduce-overhead"}, r"algorithm: torch_compile_mode='reduce-overhead'"),
