@@ -13,7 +13,7 @@ from orchestrator.spec.model import validate
 from racer.car.task import Racer, RacerPixels, RacerPixelsAndState
 from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
 from racer.tracks.geometry import on_road, place_at
-from tests.support.racer.racing import OVAL, counted, known, racer, straight
+from tests.support.racer.racing import OVAL, ahead, counted, known, racer, straight
 from tests.support.refusals import refusal
 from worker.learning.job import configure
 from worker.learning.report import figures_of, shown_of
@@ -22,13 +22,6 @@ from worker.tasks.run.policy_contract import policy_contract
 
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 15, 0, -15, -30)]
 DISCRETE = {"action_space": FIVE, "action_space_type": "discrete", "sensor": ["FRONT_FACING_CAMERA"], "version": "5"}
-
-
-def ahead(task: Racer, speed: float = 0.0) -> torch.Tensor:
-    """Steer for the third waypoint."""
-    column = task.observation_names.index("waypoint_2_x")
-    x, y = task.observations[:, column], task.observations[:, column + 1]
-    return torch.stack((torch.atan2(y, x) / 0.5236, torch.full_like(x, speed)), 1)
 
 
 def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
