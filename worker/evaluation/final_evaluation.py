@@ -6,7 +6,7 @@ import io
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 from shared_store.contract.phases import Phase
 from shared_store.volume.files import write_atomic
@@ -21,12 +21,18 @@ from worker.tasks.run.adapting import adaptive_steps, begin_evaluation
 
 if TYPE_CHECKING:
     from worker.learning.loop import Loop
+    from worker.settings.task import TaskConfig
     from worker.tasks.run.task import Task
-    from worker.telemetry.picture import EpisodePicture
 
 
 EVALUATED = 256
 """Greatest number of worlds that a rank builds for the evaluation: the worlds of training still hold their memory."""
+
+
+class Drawing(Protocol):
+    """Watches worlds while a policy is evaluated in them, and draws what it saw."""
+
+    def picture(self, config: TaskConfig) -> bytes: ...
 
 
 class FinalEvaluation(Hook):
@@ -36,7 +42,7 @@ class FinalEvaluation(Hook):
         draw: Begins a drawing of the evaluation's worlds, on the main rank; None for a training without a picture.
     """
 
-    def __init__(self, draw: Callable[[Task], EpisodePicture] | None = None) -> None:
+    def __init__(self, draw: Callable[[Task], Drawing] | None = None) -> None:
         self._draw = draw
 
     def trained(self, loop: Loop, checkpoint: str) -> None:

@@ -1,4 +1,4 @@
-"""rsl_rl's algorithms learn on real worlds: networks with memory, symmetry, curiosity, a student from its teacher."""
+"""rsl_rl's algorithms learn on real worlds: a network with memory, symmetry, curiosity, a student from its teacher."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SAC learns the point task and Cartpole."""
+"""SAC learns Cartpole."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images of a training that runs: what a recording and the live view have of them is what its worlds' cameras saw, byte for byte."""
+"""Images of a training that runs: what a recording has of them is what its worlds' cameras saw, byte for byte. The live view: test_view.py."""
 
 from __future__ import annotations
 
