@@ -181,15 +181,6 @@ def test_a_hairpin_may_turn_about_one_point_of_its_inner_border() -> None:
     assert Track("hairpin", **rings).length > 18
 
 
-def test_the_arrays_of_a_track_are_its_own_and_cannot_be_written() -> None:
-    rings = parts()
-    track = Track("circle", **rings)
-    rings["center"][0] = 0
-    assert track.center[0, 0] == 3.0
-    with pytest.raises(ValueError, match="read-only"):
-        track.center[0, 0] = 1.0
-
-
 def test_every_preset_can_be_driven_both_ways() -> None:
     for preset in PRESETS:
         present, back = make_preset(preset), make_preset(preset, direction=CLOCKWISE)
