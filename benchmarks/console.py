@@ -197,7 +197,7 @@ def points(browser: Browser, server: Serving) -> list[float]:
         metrics.write({"iteration": 10**9, "reward": 0})
         page.goto(f"/jobs/{job}")
         page.wait_for_selector("[data-charts] svg")
-        existing = "told => [...document.querySelectorAll('[data-charts] li b')].some((each) => each.textContent === told) && Date.now()"
+        existing = "shown => [...document.querySelectorAll('[data-charts] li b')].some((each) => each.textContent === shown) && Date.now()"
         for number in range(1, EVENTS + 1):
             time.sleep(0.37)  # in step with nothing
             written = time.time()

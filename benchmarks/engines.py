@@ -119,7 +119,7 @@ def _write() -> None:
         f"{TRIES}. Memory is proportional set size in MiB:\nof the controller, and of what the engine itself runs on all its nodes "
         "together (Ray: a head and three nodes; Slurm: slurmctld and three slurmd).\n`aws-batch` is a second Muster in AWS's place: "
         "what AWS itself takes (instances, images) is not in it.\n"
-        "Steps/s: cart-pole, two nodes of 256 worlds and a core each, all that there are. On Ray the last to go is the job's "
+        "Steps/s: cart-pole, two nodes of 256 worlds and a core each, all of the machine's. On Ray the last to go is the job's "
         "driver, which keeps\nthe gang's place for 15 s; the nodes themselves are gone at once. A node's death is that of its supervisor; of a whole machine's see the tests of each engine.\n\n"
         "| engine | submit → first rank | rank's death → noticed | node's death → noticed | → runs again | stop → nothing left | "
         "steps/s | controller | engine |\n|---|---|---|---|---|---|---|---|---|\n"

@@ -5,7 +5,7 @@
 
 Gangs of one node run on an engine that starts nothing (:mod:`benchmarks.scale`): each leaves a run with an outcome and a log, durably on
 this disk. Meanwhile one pass of retention follows another, in the steps and with the rests that they always have. After each round a line
-shows what there is; with ``--off``, without retention. A loaded machine is refused: :mod:`benchmarks.load`.
+shows the contents of the store; with ``--off``, without retention. A loaded machine is refused: :mod:`benchmarks.load`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class LoggingEngine(ShortEngine):
 
 @dataclass(frozen=True)
 class Size:
-    """What there is."""
+    """The contents of the store."""
 
     jobs: int
     rows: int
@@ -75,7 +75,7 @@ def size(bench: Bench[LoggingEngine]) -> Size:
 
 
 def rounds(bench: Bench[LoggingEngine], jobs: int, count: int, takes: bool = True) -> list[Size]:
-    """Jobs through the controller, in so many rounds; what there is after each, and after the last pass."""
+    """Jobs through the controller, in so many rounds; the store's contents after each, and after the last pass."""
     found: list[Size] = []
     loop: list[float] = []
     monitoring = bench.controller.monitoring

@@ -36,7 +36,7 @@ TABLES = ("jobs", "attempts", "nodes", "runs", "job_definitions", "dependencies"
 
 @dataclass
 class Sample:
-    """What there is at a moment."""
+    """The state at a moment."""
 
     hours: float
     ended: int

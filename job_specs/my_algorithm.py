@@ -1,4 +1,4 @@
-"""An algorithm of one's own, whole: advantage actor-critic (A2C, arXiv:1602.01783). `job_specs/my-algorithm.yaml` trains with it.
+"""A custom algorithm, whole: advantage actor-critic (A2C, arXiv:1602.01783). `job_specs/my-algorithm.yaml` trains with it.
 
 An iteration is: begin; then `steps` times act, the task's step, record; then learn. worker/learning/algorithm.py says all of it.
 W is the number of worlds that this rank simulates. All is plain torch, and runs on CPU and GPU, on one rank or many.

@@ -31,7 +31,7 @@ SHOWN = 10
 
 
 def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
-    """The task as it was when the iteration began, and the file's content. Raises UserError for what is no such file."""
+    """The task as it was when the iteration began, and the file's content. Raises UserError for any other file."""
     import torch
 
     from worker.tasks import find_task

@@ -252,7 +252,7 @@ def afterwards(directory: str, kind: str) -> int:
     described = run.description()
     spec = (described or {}).get("spec") or {}
     if not described or "train" not in spec:
-        return _fail(f"{run.path} is no run that a `train` job made; name a directory of runs/ in the store")
+        return _fail(f"{run.path} is not a run that a `train` job made; name a directory of runs/ in the store")
     if kind not in SERVICES:
         return _fail(f"no service is called {kind}; there are: {', '.join(SERVICES)}")
     service = SERVICES[kind](tracked_of(run, spec["train"], {}), (spec.get("track") or {}).get(kind) or {})

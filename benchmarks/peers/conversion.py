@@ -108,10 +108,10 @@ def read_rsl_rl(path: Path | str, activation: str = "elu", device: str = "cpu") 
     except FileNotFoundError:
         raise ValueError(f"there is no checkpoint {path}") from None
     except Exception as error:
-        raise ValueError(f"{path} is no checkpoint of rsl_rl: {str(error).splitlines()[0]}") from error
+        raise ValueError(f"{path} is not a checkpoint of rsl_rl: {str(error).splitlines()[0]}") from error
     if not isinstance(found, dict) or "actor_state_dict" not in found:
         keys = ", ".join(map(str, found)) if isinstance(found, dict) else type(found).__name__
-        raise ValueError(f"{path} is no checkpoint of rsl_rl 5: it has no actor_state_dict, but {keys}")
+        raise ValueError(f"{path} is not a checkpoint of rsl_rl 5: it has no actor_state_dict, but {keys}")
     actor = found["actor_state_dict"]
     numbers = sorted(int(key.split(".")[1]) for key in actor if key.startswith("mlp.") and key.endswith(".weight"))
     known = {f"mlp.{number}.{part}" for number in numbers for part in ("weight", "bias")}
@@ -119,7 +119,7 @@ def read_rsl_rl(path: Path | str, activation: str = "elu", device: str = "cpu") 
         key for key in actor if key not in known and not key.startswith(("obs_normalizer.", "distribution."))
     )
     if strange or not numbers:
-        raise ValueError(f"{path}: its actor is no plain network, it has {', '.join(strange) or 'no layers'}")
+        raise ValueError(f"{path}: its actor is not a plain network, it has {', '.join(strange) or 'no layers'}")
     layers = [(actor[f"mlp.{number}.weight"], actor[f"mlp.{number}.bias"]) for number in numbers]
     moments = (actor.get(f"obs_normalizer.{name}") for name in ("_mean", "_std"))
     mean, deviation = (None if each is None else each.flatten() for each in moments)

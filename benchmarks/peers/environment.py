@@ -93,7 +93,7 @@ def version_of(python: str) -> tuple[int, int]:
     try:
         output = subprocess.run([python, "-c", requested], check=True, capture_output=True, text=True).stdout
     except (OSError, subprocess.CalledProcessError) as error:
-        raise ValueError(f"{python} is no Python that can be started ({error}); name one with --python") from error
+        raise ValueError(f"{python} is not a Python that can be started ({error}); name one with --python") from error
     major, minor = map(int, output.split())
     return major, minor
 

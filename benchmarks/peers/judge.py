@@ -75,7 +75,7 @@ def read_record(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} can't be read: {error}") from error
     missing = [key for key in ("peer", "case", "limits", "rate", "curve", "checkpoints") if key not in record]
     if missing:
-        raise ValueError(f"{path} is no record of a training: it has no {', '.join(missing)}")
+        raise ValueError(f"{path} is not a record of a training: it has no {', '.join(missing)}")
     return dict(record)
 
 

@@ -75,7 +75,7 @@ def open_bundle(path: Path) -> Bundle:
         if lie_elsewhere(content["policy.onnx"]):
             raise Refused(f"{path}: policy.onnx has weights in another file (external_data); export the policy again")
     except ValueError:
-        raise Refused(f"{path}: policy.onnx is no ONNX file; export the policy again") from None
+        raise Refused(f"{path}: policy.onnx is not an ONNX file; export the policy again") from None
     contract = read(content["contract.json"], f"{path}: contract.json")
     return Bundle(path, manifest, contract, content["policy.onnx"], content["parity.npz"])
 
@@ -139,7 +139,7 @@ def lie_elsewhere(model: bytes) -> bool:
     """Whether a tensor of an ONNX model lies in another file.
 
     Raises:
-        ValueError: The bytes are no protobuf.
+        ValueError: The bytes aren't a protobuf.
     """
     pending = [("ModelProto", memoryview(model))]
     while pending:

@@ -169,7 +169,7 @@ def read(text: bytes, where: str) -> Contract:
         where: What to call it in an error.
 
     Raises:
-        Refused: It is no contract, or a newer one.
+        Refused: It is not a contract, or it is a newer one.
     """
     try:
         found = json.loads(text)
@@ -180,7 +180,7 @@ def read(text: bytes, where: str) -> Contract:
     except KeyError as error:
         raise Refused(f"{where}: {error.args[0]} is missing; export the policy again") from None
     except (ValueError, TypeError, AttributeError) as error:
-        raise Refused(f"{where}: it is no policy contract ({error}); export the policy again") from None
+        raise Refused(f"{where}: it is not a policy contract ({error}); export the policy again") from None
     if not 0.0 < contract.control_hz <= 10_000.0:
         raise Refused(f"{where}: control_hz is {contract.control_hz:g}; export the policy again")
     for group in contract.groups:

@@ -11,11 +11,11 @@ class Refused(Exception):
 
 
 def nearest(name: str, names: Iterable[str], what: str = "there are") -> str:
-    """``did you mean NAME?`` where one is close, else the names that there are.
+    """``did you mean NAME?`` where one is close, else the known names.
 
     Args:
         name: What was looked for.
-        names: What there is.
+        names: The known names.
         what: Begins the list of names.
     """
     known = sorted(names)

@@ -225,7 +225,7 @@ def _rotation(turn: Any) -> np.ndarray:
     found = _finite((turn.x, turn.y, turn.z, turn.w), "orientation")
     length = float(np.sqrt((found * found).sum()))
     if abs(length - 1.0) > 0.01:
-        raise Refused(f"its orientation is no rotation: a quaternion of length {length:.3g}")
+        raise Refused(f"its orientation is not a rotation: a quaternion of length {length:.3g}")
     return found / length
 
 

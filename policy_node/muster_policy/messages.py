@@ -60,7 +60,7 @@ class Messages:
         try:
             return self._store.deserialize_cdr(data, name)
         except Exception as error:  # malformed bytes can raise any error in the reader
-            raise Refused(f"{len(data)} bytes that are no {name} ({type(error).__name__})") from None
+            raise Refused(f"{len(data)} bytes that aren't a {name} ({type(error).__name__})") from None
 
     def stamp(self, nanoseconds: int) -> Any:
         """A ``builtin_interfaces/Time``."""

@@ -295,7 +295,7 @@ class Observations:
         if not term.library:
             if self._contract.format < 2:
                 raise Refused("the contract is of format 1, which does not say what it is; export the policy again")
-            raise Refused(f"{term.quantity or 'a quantity that is not declared'} is no function of Muster's library")
+            raise Refused(f"{term.quantity or 'a quantity that is not declared'} is not a function of Muster's library")
         if term.kind == "command":
             return self._command(term)
         if term.kind == "previous_action":

@@ -219,7 +219,7 @@ class Racing:
     Attributes:
         arrays: What the cars' functions read.
         reward: The function.
-        called: Whether it is called: a trial step, before the worlds begin, is no step of a car.
+        called: Whether it is called: a trial step, before the worlds begin, is not a step of a car.
     """
 
     needs_bodies = False

@@ -26,7 +26,7 @@ SIM_TRACE_COLUMNS = (
 )
 """Of a SimTrace file, as DeepRacer's community reads it."""
 CONTINUOUS = -1.0
-"""Number of an action that is no choice."""
+"""Number of an action that is not a choice."""
 _STATUS = {"time_out": "time_up"}
 """SimTrace's names of ends where they differ from ours."""
 

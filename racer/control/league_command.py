@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from orchestrator.cli.command_options import (
     CpusOption,
@@ -20,13 +19,14 @@ from orchestrator.cli.command_options import (
     split_model,
 )
 from orchestrator.cli.controllers import controller, see_through
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.progress import summary
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, NotServing, UsageError
-from racer.control.league_table import COLUMNS, cells, write
+from racer.control.league_table import TABLE, write
 from racer.store.leagues import moment
 from racer.store.races import clock
 from racer.store.standings import RANKINGS, differences
@@ -42,6 +42,34 @@ _EXAMPLES = """Examples:  muster league create cup --track oval --laps 3   then 
 muster league table cup -o cup.png   and   muster league verify cup 1 --rerun"""
 
 
+def _state(league: Mapping[str, Any]) -> str:
+    if league["closed"]:
+        return str(league["closed"]).removeprefix(f"league {league['name']} ")
+    return f"open until {moment(league['closes'])}" if league["closes"] else "open"
+
+
+_LEAGUES = Resource(
+    {
+        "LEAGUE": "name",
+        "TRACK": lambda league: ", ".join(league["track"]),
+        "LAPS": lambda league: league["rules"]["laps"],
+        "RANKING": lambda league: league["rules"]["ranking"],
+        **{"ENTRIES": "entries", "OWNER": "owner", "STATE": _state},
+    },
+    "no league was created yet; muster league create NAME --track oval",
+    "/api/leagues",
+)
+_LAPS = Resource(
+    {
+        "LAP": "trial",
+        "TIME": lambda lap: clock(lap.get("time")),
+        "PENALTY": lambda lap: f"{lap.get('penalty') or 0:g} s",
+        "COMPLETE": lambda lap: f"{lap.get('completion') or 0:.1f} %",
+        **{"OFF-TRACKS": "off_tracks", "CRASHES": "crashes", "RESETS": "resets", "STATUS": "status"},
+    }
+)
+
+
 def register(app: typer.Typer) -> None:
     group = make_group(
         "Manage the racer's leagues: create, submit, table, verify and more. Leagues are append-only.",
@@ -50,7 +78,7 @@ def register(app: typer.Typer) -> None:
     group.command(
         "create", epilog="Example:  muster league create cup --track oval --ranking best --closes 2026-12-24T18:00"
     )(create)
-    group.command("list", epilog="Example:  muster league list --json")(list_leagues)
+    _LEAGUES.add_list(group, "List the leagues with their rules.", "Example:  muster league list --json")
     group.command("show", epilog="Example:  muster league show cup     or, an entry:  muster league show cup 3")(show)
     group.command("submit", epilog="Example:  muster league submit cup fast@2 --as ada")(submit)
     group.command("table", epilog="Example:  muster league table cup -o cup.csv")(show_table)
@@ -139,35 +167,6 @@ def _moment(option: str, text: str | None) -> float | None:
         raise UsageError(f"{option} {text}: expected a time such as 2026-12-24T18:00, or 2026-12-24T18:00Z") from None
 
 
-def list_leagues(store: StoreOption = None, as_json: JsonOption = False) -> None:
-    """List the leagues with their rules."""
-    with controller(store, None) as connect:
-        found = connect().get("/api/leagues")
-    if as_json:
-        echo_json(found, indent=1)
-        return
-    if not found:
-        echo("no league was created yet; muster league create NAME --track oval")
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("LEAGUE", "TRACK", "LAPS", "RANKING", "ENTRIES", "OWNER", "STATE"):
-        table.add_column(column, no_wrap=True)
-    for each in found:
-        if "problem" in each:
-            table.add_row(each["name"], *["-"] * 5, each["problem"])
-            continue
-        rules = each["rules"]
-        measures = (str(rules["laps"]), rules["ranking"], str(each["entries"]), each["owner"])
-        table.add_row(each["name"], ", ".join(each["track"]), *measures, _state(each))
-    print_cut(table)
-
-
-def _state(league: Mapping[str, Any]) -> str:
-    if league["closed"]:
-        return str(league["closed"]).removeprefix(f"league {league['name']} ")
-    return f"open until {moment(league['closes'])}" if league["closes"] else "open"
-
-
 def show(
     league: LeagueArgument, entry: OptionalEntry = None, store: StoreOption = None, as_json: JsonOption = False
 ) -> None:
@@ -206,14 +205,7 @@ def _print_entry(entry: Mapping[str, Any]) -> None:
     if "race" in entry:
         model, evaluation = entry["model"], entry["evaluation"]
         echo(f"entry {entry['entry']}: {entry['racer']} with {model['name']}@{model['version']} ({model['task']})")
-        table = Table(box=None, pad_edge=False)
-        for column in ("LAP", "TIME", "PENALTY", "COMPLETE", "OFF-TRACKS", "CRASHES", "RESETS", "STATUS"):
-            table.add_column(column, no_wrap=True)
-        for each in entry["race"]["trials"]:
-            counts = (str(each.get(key)) for key in ("off_tracks", "crashes", "resets"))
-            times = (clock(each.get("time")), f"{each.get('penalty') or 0:g} s", f"{each.get('completion') or 0:.1f} %")
-            table.add_row(str(each["trial"]), *times, *counts, each["status"])
-        print_cut(table)
+        _LAPS.show(entry["race"]["trials"])
         echo(f"  entered:     {moment(entry['entered'])} by {entry['owner']}")
         echo(f"  evaluation:  {evaluation['name']} of run {evaluation['run']}, job {evaluation['job']}")
         echo(f"  model:       {model['digest']}")
@@ -314,19 +306,11 @@ def show_table(
         rows = client.get(f"/api/leagues/{named(league)}/entries", every=every)
     if output is not None:
         write(found, rows, output)
-    if as_json:
-        echo_json(rows, indent=1)
-        return
-    if not rows:
-        echo(f"{league} has no entries yet; muster league submit {league} MODEL")
+    if as_json or rows:
+        TABLE.show(rows, as_json)
     else:
-        table = Table(box=None, pad_edge=False)
-        for column in COLUMNS:
-            table.add_column(column, no_wrap=True)
-        for row in rows:
-            table.add_row(*cells(row))
-        print_cut(table)
-    if output is not None:
+        echo(f"{league} has no entries yet; muster league submit {league} MODEL")
+    if output is not None and not as_json:
         echo(f"written: {output}")
 
 

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from orchestrator.cli.command_options import JsonOption, OverwriteOption, StoreOption
 from orchestrator.cli.controllers import controller
+from orchestrator.cli.listings import Resource
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import ServerError, UsageError
 from racer.control.track_orders import carry_out
 
@@ -29,6 +29,29 @@ NewName = Annotated[str, typer.Option("--name", help="Name of the track.")]
 
 _EXAMPLES = """Examples:  muster tracks show random:7 -o track.png
 muster tracks make hills --seed 7 --length 45   then   muster tracks list"""
+
+
+def _width(track: Mapping[str, Any]) -> str:
+    least, most = track["width"]
+    return f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m"
+
+
+def _origin(origin: Mapping[str, Any]) -> str:
+    """The origin of a track, then its settings."""
+    keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
+    return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)
+
+
+_TRACKS = Resource(
+    {
+        "TRACK": "name",
+        "LENGTH": lambda track: f"{track['length']:.2f} m",
+        "WIDTH": _width,
+        "RADIUS": lambda track: f"{track['least_radius']:.2f} m",
+        **{"DIRECTION": "direction", "WAYPOINTS": "waypoints"},
+        "FROM": lambda track: _origin(track["origin"]),
+    }
+)
 
 
 def register(app: typer.Typer) -> None:
@@ -47,20 +70,7 @@ def register(app: typer.Typer) -> None:
 
 def list_tracks(store: StoreOption = None, as_json: JsonOption = False) -> None:
     """List the presets and the tracks of the store, with their measures."""
-    found = _request({"action": "list"}, store)
-    if as_json:
-        echo_json(found, indent=1)
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("TRACK", "LENGTH", "WIDTH", "RADIUS", "DIRECTION", "WAYPOINTS", "FROM"):
-        table.add_column(column, no_wrap=True)
-    for track in found:
-        if "problem" in track:
-            table.add_row(track["name"], *["-"] * 5, track["problem"])
-            continue
-        measures = (f"{track['length']:.2f} m", _width(track), f"{track['least_radius']:.2f} m", track["direction"])
-        table.add_row(track["name"], *measures, str(track["waypoints"]), _origin(track["origin"]))
-    print_cut(table)
+    _TRACKS.show(_request({"action": "list"}, store), as_json)
 
 
 def show(
@@ -163,14 +173,3 @@ def _print(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None
         echo(f"  lies in:    {path}")
     if output is not None:
         echo(f"written: {output}")
-
-
-def _width(track: Mapping[str, Any]) -> str:
-    least, most = track["width"]
-    return f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m"
-
-
-def _origin(origin: Mapping[str, Any]) -> str:
-    """The origin of a track, then its settings."""
-    keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
-    return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)

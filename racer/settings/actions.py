@@ -117,7 +117,7 @@ def action_space(content: Any) -> ActionSpace:
     looked at.
 
     Raises:
-        Refused: It has none, a value is no number, or there is no such sensor.
+        Refused: It has none, a value is not a number, or there is no such sensor.
     """
     if isinstance(content, Sequence) and not isinstance(content, str):
         content = {"action_space": content}
@@ -224,7 +224,7 @@ def _range(name: str, ends: Any, limits: tuple[float, float], unit: str, notes: 
 
 
 def _check_keys(where: tuple[str | int, ...], value: Any, keys: Sequence[str]) -> None:
-    """Refuse what is no mapping with these keys; others beside them, such as ``index``, are not looked at."""
+    """Refuse all but a mapping with these keys; others beside them, such as ``index``, are not looked at."""
     if not isinstance(value, Mapping):
         raise Refused(where, f"expected an object of {', '.join(keys)}, found {shown(value)}")
     missing = [key for key in keys if key not in value]

@@ -40,7 +40,7 @@ class TrainingFacts:
 
 
 Meaning = tuple[dict[Setting, Any], str]
-"""Settings, and a note; empty where nothing is to be said."""
+"""Settings, and a note; empty where there is nothing to report."""
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ class BadTrack(UserError):
 
 
 def check(center: Floats, inner: Floats, outer: Floats, closed: bool = True) -> None:
-    """Raise BadTrack for lines that are no track.
+    """Raise BadTrack for lines that aren't a track.
 
     Args:
         center: Waypoints of the centre line (N, 2) [m] in driving order, the first one not repeated.

@@ -6,7 +6,6 @@ look for the nearest segment, then take the rest from it. Of several nearest seg
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,8 +136,3 @@ def advance(track: Track, before: Any, after: Any) -> Floats:
         half = track.length / 2
         moved = np.mod(moved + half, track.length) - half
     return moved
-
-
-def degrees(angles: Any) -> Floats:
-    """Angles [rad] in degrees from -180 to 180, as reward functions see them."""
-    return np.asarray(angles, np.float64) * (180 / math.pi)

@@ -99,7 +99,7 @@ def cross(first: wp.vec2, second: wp.vec2) -> float:
 
 @wp.func
 def is_open(road: RoadArrays, track: int) -> bool:
-    """Whether the track is no loop."""
+    """Whether the track is open, not a loop."""
     return road.segments[track] < road.count[track]
 
 
@@ -123,7 +123,7 @@ def nearest(road: RoadArrays, track: int, point: wp.vec2, begin: int, many: int)
     count = road.count[track]
     first = road.first[track]
     best, best_row, best_share = float(wp.inf), int(0), float(0.0)  # noqa: RUF046 (variables for Warp, not constants)
-    if is_open(road, track):  # those of the range that there are, and at least one
+    if is_open(road, track):  # those of the range that exist, and at least one
         begin = wp.min(begin, road.segments[track] - 1)
         many = wp.clamp(begin + many, 1, road.segments[track]) - wp.max(begin, 0)
         begin = wp.max(begin, 0)

@@ -53,7 +53,7 @@ def read_file(path: Path, name: str) -> Imported:
         name: Of the track.
 
     Raises:
-        BadTrack: The file can't be read, or it is no track.
+        BadTrack: The file can't be read, or it is not a track.
     """
     try:
         with open_regular(path.resolve()) as file:

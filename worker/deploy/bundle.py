@@ -256,7 +256,7 @@ _TAKEN = (CONTRACT, MANIFEST, REPORT)
 def bundle_documents(task: Task, algorithm: str) -> dict[str, Mapping[str, Any]]:
     """The further documents of the bundle of a policy that ``algorithm``, a name, trained; by the names of their files.
 
-    Raises UserError, which names the task or the plug-in: the documents are no JSON objects, or have a name that is not a plain one, is
+    Raises UserError, which names the task or the plug-in: the documents aren't JSON objects, or have a name that is not a plain one, is
     that of a file of every bundle, or is another's. Raises PluginError where a plug-in can't make them.
     """
     found: dict[str, Mapping[str, Any]] = {}

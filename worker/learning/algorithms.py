@@ -80,7 +80,7 @@ def refuse_incomplete(found: object, name: str, parts: Sequence[str]) -> None:
     """Raises UserError with the names of the ``parts`` that ``found`` lacks."""
     if missing := [part for part in parts if not hasattr(found, part)]:
         raise UserError(
-            f"train.algorithm: {name} is no algorithm: it lacks {', '.join(missing)} (worker.learning.algorithm)"
+            f"train.algorithm: {name} is not an algorithm: it lacks {', '.join(missing)} (worker.learning.algorithm)"
         )
 
 

@@ -1,7 +1,7 @@
 """Starting without torch's compiler: nothing here uses it, and its import takes as long as half of all other imports together.
 
 ``import tensordict`` and the first step of any optimizer import ``torch._dynamo`` only to tell it which functions it need not look
-at. Until somebody really wants it (``torch.compile``, an export), a stand-in takes these notes down.
+at. Until something really needs it (``torch.compile``, an export), a stand-in takes these notes down.
 """
 
 from __future__ import annotations

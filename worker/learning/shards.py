@@ -22,7 +22,7 @@ def read_file(checkpoint: Checkpoint, name: str, device: str = "cpu") -> dict[st
         content = torch.load(checkpoint.path / name, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
         found = re.search(r"GLOBAL ([\w.]+)", str(error))
-        what = f"asks for {found[1]}" if found else "is no plain data"
+        what = f"asks for {found[1]}" if found else "is not plain data"
         raise UserError(
             f"{where} {what}: only tensors and plain values are loaded, and nothing of it was run; choose a checkpoint "
             "that you trust"

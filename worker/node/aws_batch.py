@@ -87,7 +87,7 @@ class MainEnd:
 
 
 class _Line:
-    """One child's connection and what it said."""
+    """One child's connection and its messages."""
 
     def __init__(self, connection: socket.socket) -> None:
         self._connection, self._partial = connection, b""
@@ -224,7 +224,7 @@ def complete(env: Mapping[str, str]) -> tuple[NodeContract, dict[str, str]]:
 
 
 def own_address(env: Mapping[str, str]) -> str:
-    """This node's IPv4 address: what it was told, what ECS says of its task, or that of the route to the outside."""
+    """This node's IPv4 address: as configured, as ECS reports of its task, or that of the route to the outside."""
     if env.get("MUSTER_ADDRESS"):
         return env["MUSTER_ADDRESS"]
     if uri := env.get("ECS_CONTAINER_METADATA_URI_V4"):

@@ -1,4 +1,4 @@
-"""The node's end of the bus: its presence, its progress, its log while somebody follows it, and the commands that reach it.
+"""The node's end of the bus: its presence, its progress, its log while a user follows it, and the commands that reach it.
 
 Only the supervisor speaks on the bus; training knows nothing of it, so a bus that is off, slow or restarted can't be noticed
 there. Nothing in here waits: a router that can't be reached is tried again, and what is put meanwhile is lost, which is allowed.
@@ -80,7 +80,7 @@ class NodeBus:
 
     @property
     def is_followed(self) -> bool:
-        """Whether somebody follows the node's log."""
+        """Whether a user follows the node's log."""
         return self._session is not None and time.monotonic() < self._followed_until
 
     def push_log(self, position: int, data: bytes) -> None:
@@ -97,7 +97,7 @@ class NodeBus:
             self._put_progress({**(progress or {}), LOG_END: end, LOG_IS_WHOLE: True})
 
     def tend(self, progress: dict[str, Any] | None, log_end: Callable[[], int | None] = lambda: None) -> None:
-        """Open the session where there is none yet, and publish ``progress`` once a second: an empty one, too, is a sign of life.
+        """Open the session where there is none yet, and publish ``progress`` once a second: an empty one, too, is a heartbeat.
 
         ``log_end``: the end of the node's log [bytes], which its followers get; None where it is unknown.
         """

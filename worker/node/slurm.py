@@ -30,7 +30,7 @@ def meet() -> str:
     facts = "\n".join(_lines("scontrol", "--oneliner", "show", "node", os.environ["SLURM_JOB_NODELIST"]))
     by_name = {m[1]: m[2] for m in re.finditer(r"^NodeName=(\S+) .*?NodeAddr=(\S+)", facts, re.MULTILINE)}
     addresses = [socket.gethostbyname(by_name.get(name, name)) for name in names]
-    # Debian's /etc/hosts gives a host a loopback address of its own, which is no use to the others
+    # Debian's /etc/hosts gives a host a loopback address of its own, which the others can't use
     far = next((a for a in addresses if not ipaddress.ip_address(a).is_loopback), None)
     if far is not None and ipaddress.ip_address(addresses[0]).is_loopback:
         addresses[0] = address_towards(far)

@@ -104,7 +104,7 @@ class Supervisor:
                 self.write(None, "e", reason)
                 node, epoch, ended = self.contract.node_index, self.contract.epoch, time.time()
                 return self._commit(Outcome(node, epoch, 127, None, reason, None, started, ended, cannot_start=True))
-            if self.stopping:  # asked while the ranks were being started: they have not heard it
+            if self.stopping:  # asked while the ranks were being started: they have not received it
                 self._ask_ranks()
             while any(rank.running for rank in self.ranks):
                 self._read(timeout=0.1)
@@ -259,7 +259,7 @@ class Supervisor:
         self.write_lines(rank, stream, [text])
 
     def write_lines(self, rank: int | None, stream: str, texts: Sequence[str]) -> None:
-        """Append lines to the node's log. A full or lost volume is said once on stderr; the ranks go on.
+        """Append lines to the node's log. A full or lost volume is reported once on stderr; the ranks go on.
 
         The log counts the lines that it could not take as soon as it takes one again.
         """

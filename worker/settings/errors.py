@@ -1,4 +1,4 @@
-"""Errors that are told in one line, without a traceback. Imports nothing slow: signals are caught and errors told from the start."""
+"""Errors that are reported in one line, without a traceback. Imports nothing slow: signals are caught and errors reported from the start."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import field
 from types import MappingProxyType
@@ -12,6 +13,7 @@ from pydantic.dataclasses import dataclass
 
 from worker.settings.ppo import PPOConfig
 from worker.settings.task import STRICT, Count, Points, Positive, Range, Rate, TaskConfig, reward_weights
+from worker.settings.velocity import PPO
 
 CALM = ((0, -0.01), (499, -0.01), (500, -0.1), (999, -0.1), (1000, -1.0))
 """Weight of ``joint_vel_hinge`` by iteration: mjlab's stages at 12,000 and 24,000 control steps, of iterations of 24."""
@@ -62,21 +64,7 @@ class LiftCubeConfig(TaskConfig):
     - ``joint_vel_hinge``: sum of the squares of how much faster than 0.5 joints are [rad/s, m/s]; ``curriculum`` raises it."""
     curriculum: Mapping[str, Points] = field(default_factory=lambda: MappingProxyType({"joint_vel_hinge": CALM}))
     """As that of every task; by default ``joint_vel_hinge`` weighs -0.01, from iteration 500 on -0.1, from 1000 on -1."""
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            steps=24,
-            hidden_sizes=(512, 256, 128),
-            critic_observations="critic",
-            activation="elu",
-            epochs=5,
-            minibatches=4,
-            learning_rate=1.0e-3,
-            learning_rate_horizon=500,  # it takes as long to lift
-            desired_kl=0.01,
-            entropy_coef=0.005,
-            max_std=10.0,  # as of the robots that walk
-        )
-    )
+    ppo: PPOConfig = field(default_factory=lambda: dataclasses.replace(PPO, entropy_coef=0.005))
     """Settings of the task's training."""
 
 

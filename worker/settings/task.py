@@ -269,7 +269,7 @@ class TaskConfig(_Common):
         return None
 
     def notes(self, algorithm: str) -> list[str]:
-        """A line for each value that is taken but not meant, or not done, exactly so; told at the submission.
+        """A line for each value that is taken but not meant, or not done, exactly so; reported at the submission.
 
         Args:
             algorithm: Name of the algorithm that trains.

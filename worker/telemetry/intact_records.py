@@ -74,7 +74,7 @@ def fits(opcode: int, length: int, body: bytes, ended: bool) -> bool:
 def identify(record: bytes) -> tuple[int, str]:
     """Opcode of a damaged record by the lengths inside it, or else by its own opcode and length, and an attachment's name.
 
-    0 where the bytes are no single record.
+    0 where the bytes aren't a single record.
     """
     body = record[9:]
     kinds = (CHUNK, ATTACHMENT, METADATA, INDEX, DATA_END)

@@ -39,7 +39,7 @@ class Replay:
         count: Control steps that were read.
 
     Raises:
-        UserError: It is no such file.
+        UserError: It is not such a file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -115,11 +115,11 @@ class Replay:
             raise
         except Exception as error:  # rosbags raises whatever its generated code meets in the bytes of another program
             raise UserError(
-                f"{self.path}: it is no recording of Muster's, whose topics have other messages; `rerun {self.path.name}` may show it"
+                f"{self.path}: it is not a recording of Muster's: its topics have other messages; `rerun {self.path.name}` may show it"
             ) from error
 
     def _messages(self) -> Iterator[tuple[str, str, int, bytes]]:
-        """Type, topic, time [ns] and content, as they were written. Sets :attr:`cut`. Raises UserError where it is no MCAP file."""
+        """Type, topic, time [ns] and content, as they were written. Sets :attr:`cut`. Raises UserError where it is not an MCAP file."""
         from mcap.records import Channel, Message, Schema
 
         kinds: dict[int, str] = {}

@@ -190,7 +190,7 @@ class Segment:
 
     Raises:
         OSError: It can't be mapped.
-        ValueError: It is no such file, or one of another layout.
+        ValueError: It is not such a file, or one of another layout.
     """
 
     def __init__(self, path: Path, layout: Layout, file: int) -> None:

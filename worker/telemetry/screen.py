@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is said in one line, by who started it
+os.environ["RUST_LOG"] = "off"  # read by the import: a server that is gone is reported in one line, by who started it
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -238,7 +238,7 @@ def _blueprint(placed: np.ndarray, cameras: Sequence[str], live: bool) -> rrb.Bl
         rrb.TimeSeriesView(name="Return", contents="/return/**"),
         rrb.TimeSeriesView(name="Reward terms", contents="/terms", time_ranges=recent),
     )
-    # each line begins with its time and who said it: the view's own columns for these are too narrow to be read
+    # each line begins with its time and its source: the view's own columns for these are too narrow to be read
     log = rrb.TextLogView(
         name="Log",
         contents="/log",

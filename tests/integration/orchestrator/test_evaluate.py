@@ -67,7 +67,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("line", REFUSED)
-def test_what_can_not_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
+def test_what_cannot_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
     assert REFUSED[line] in refusal(full, "evaluate", *shlex.split(line))
 
 

@@ -50,7 +50,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("line", REFUSED)
-def test_what_can_not_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
+def test_what_cannot_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
     assert REFUSED[line] in refusal(full, "evaluate", *shlex.split(line))
 
 
@@ -83,7 +83,7 @@ def test_copying_step_logs_replaces_no_file(full: Serving, tmp_path: Path) -> No
         "clone racer --name other --set train.config.track=ovall --dry-run",
     ],
 )
-def test_a_training_on_an_unknown_track_is_told_the_nearest_name(full: Serving, line: str) -> None:
+def test_a_training_on_an_unknown_track_is_refused_with_the_nearest_name(full: Serving, line: str) -> None:
     assert refusal(full, *shlex.split(line)).endswith(f"train.config.track: track ovall does not exist; {NAMED}\n")
 
 

@@ -47,7 +47,7 @@ def test_a_track_has_its_facts_and_the_picture_of_the_command(console: Console) 
 
 
 @pytest.mark.parametrize("name", ["ovall", "random:x", "<script>alert(1)</script>", "..%2f..%2fetc", "-o"])
-def test_an_unknown_track_is_told_with_the_nearest_name(visitor: Visitor, name: str) -> None:
+def test_an_unknown_track_is_refused_with_the_nearest_name(visitor: Visitor, name: str) -> None:
     of_one = (f"/tracks/{name}{file}" for file in ("", "/outline.svg", "/picture.png"))
     for path in (*of_one, f"/tracks?name={name}"):
         answer = visitor.http.get(path)
@@ -140,7 +140,7 @@ def test_leagues_are_listed_with_their_rules_and_their_table(console: Console, s
     assert visitor.http.get("/leagues/cup/entries/9").status_code == 404
 
 
-def test_a_league_is_created_by_a_form_and_wrong_rules_are_told(console: Console, store: Store) -> None:
+def test_a_league_is_created_by_a_form_and_wrong_rules_are_refused(console: Console, store: Store) -> None:
     visitor = console.visitor()
     rules = {"name": "grand", "track": ["oval", "", " random:7 "], "laps": "4", "ranking": "best", "continuous": "true"}
     rules |= {"closes": "2999-01-01T00:00", "opens": "", "seed": "3", "off_track_penalty": "2.5"}
@@ -208,7 +208,7 @@ def test_what_has_succeeded_is_entered_for_good(console: Console, visitor: Visit
     assert "are as they were entered" in shown.text and f"/jobs/{job}" in [each.get("href") for each in shown.all("a")]
 
 
-def test_an_entry_is_disqualified_once_the_person_has_said_yes(console: Console, store: Store) -> None:
+def test_an_entry_is_disqualified_once_the_person_has_confirmed_it(console: Console, store: Store) -> None:
     visitor = console.visitor()
     path = "/leagues/cup/entries/2/disqualify"
     assert "reason" in visitor.submit(path, reason=" ").json()["message"]

@@ -82,7 +82,7 @@ def test_code_is_text_wherever_it_is_shown(console: Console) -> None:
         ),
     ],
 )
-def test_a_path_of_the_server_in_a_request_is_told_at_its_line(
+def test_a_path_of_the_server_in_a_request_is_refused_at_its_line(
     visitor: Visitor, text: str, words: str, line: int
 ) -> None:
     problem = checked(visitor, {"yaml": text})["problem"]

@@ -1,4 +1,4 @@
-"""How a node ends: by itself, by a failure, on request, by force, and what is told of it. All of it is real."""
+"""How a node ends: by itself, by a failure, on request, by force, and what is reported of it. All of it is real."""
 
 from __future__ import annotations
 
@@ -338,7 +338,7 @@ def test_a_node_of_an_old_attempt_does_not_even_start(node: Nodes, tmp_path: Pat
     assert n.stderr.read_text().count("\n") == 1
 
 
-def test_an_epoch_that_can_not_be_read_for_a_while_does_not_stop_the_ranks(node: Nodes) -> None:
+def test_an_epoch_that_cannot_be_read_for_a_while_does_not_stop_the_ranks(node: Nodes) -> None:
     n = node()
     n.start("sh", "-c", "echo ready; sleep 2.5; echo done")
     n.wait_for_output("ready")

@@ -158,7 +158,9 @@ def test_only_loopback_is_listened_on_and_no_rank_has_rerun_in_its_memory(
     assert not [each.path for each in rank.memory_maps() if "rerun" in each.path]
 
 
-def test_a_training_has_one_reader_and_a_second_one_is_told_in_one_line(view: View, server: Serving, job: str) -> None:
+def test_a_training_has_one_reader_and_a_second_one_is_refused_in_one_line(
+    view: View, server: Serving, job: str
+) -> None:
     done = server.muster_process("view", job)
     (line,) = done.stderr.strip().splitlines()
     assert done.returncode == 1 and "is being recorded or viewed already, by process" in line

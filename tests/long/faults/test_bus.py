@@ -289,7 +289,7 @@ def test_a_rank_that_freezes_is_found_with_its_stacks_and_the_gang_restarts(serv
     assert server.muster("stop", job["id"]).returncode == 0
 
 
-def test_without_the_bus_jobs_run_and_commands_say_why_they_can_not(
+def test_without_the_bus_jobs_run_and_commands_say_why_they_cannot(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MUSTER_BUS_OFF", "1")

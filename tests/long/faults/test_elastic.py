@@ -117,14 +117,6 @@ def test_the_run_keeps_its_worlds_and_its_history(server: Serving, resized: tupl
     assert [record["env_steps"] for record in records] == [steps, 2 * steps, 3 * steps, 4 * steps]
 
 
-def test_a_resume_on_more_ranks_than_worlds_is_refused(
-    server: Serving, resized: tuple[str, Path, list[Checkpoint]]
-) -> None:
-    tiny = ["--nodes", "30", "--set", "resources.cpus=0.1", "--set", "train.iterations=9"]
-    done = server.muster("resume", resized[0], *tiny)
-    assert done.returncode == 2 and "14 worlds can't be distributed over 30 ranks; use fewer nodes" in done.stderr
-
-
 def test_the_worlds_are_known_without_a_readable_checkpoint(
     server: Serving, resized: tuple[str, Path, list[Checkpoint]], tmp_path: Path
 ) -> None:

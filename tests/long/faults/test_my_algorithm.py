@@ -18,7 +18,6 @@ from tests.support.worker.loop import iterate, mean_return, setting_of
 from tests.support.worker.point_task import Point, PointConfig
 from tests.support.worker.ranks import run_ranks, training
 from worker.learning.algorithms import find_algorithm, settings
-from worker.settings.errors import UserError
 
 SPEC = "job_specs/my-algorithm.yaml"
 OWN = "job_specs.my_algorithm:Mine"
@@ -49,16 +48,6 @@ def test_it_learns_cartpole_as_it_is_shipped(mine: type) -> None:
     assert mean_return(algorithm.policy(), held_out) < 5.0
     iterate(algorithm, task, 0, section["iterations"])
     assert mean_return(algorithm.policy(), held_out) > 20.0
-
-
-def test_its_settings_are_checked(mine: type) -> None:
-    for values, message in (
-        ({"gama": 0.9}, "train.settings.gama: there is no such setting; did you mean gamma?"),
-        ({"gamma": 2.0}, "train.settings.gamma: expected a value less than or equal to 1, found 2.0"),
-    ):
-        with pytest.raises(UserError) as caught:
-            settings(mine, OWN, PointConfig(), {"settings": values})
-        assert str(caught.value) == message
 
 
 def test_killed_it_ends_with_the_same_bits_and_is_evaluated_and_exported(tmp_path: Path) -> None:

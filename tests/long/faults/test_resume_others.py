@@ -1,4 +1,4 @@
-"""Every setting of ``sac``, ``rsl_rl`` and an algorithm of one's own is applied to what a resumed run's learner uses, or refused by name."""
+"""Every setting of ``sac``, ``rsl_rl`` and a custom algorithm is applied to what a resumed run's learner uses, or refused by name."""
 
 from __future__ import annotations
 
@@ -257,14 +257,6 @@ def test_a_setting_of_curiosity_that_is_accepted_is_what_it_uses(store: Path, ke
         assert curiosity.initial_weight == pytest.approx(0.5 * 0.1), "rsl_rl scales it by the length of a step"
     else:
         assert curiosity.weight_scheduler is not None or curiosity.weight_scheduler_params is not None
-
-
-@pytest.mark.parametrize(
-    "name", sorted(SET_BY_MUSTER - {"self", "kwargs", "storage", "actor", "critic", "student", "teacher"})
-)
-def test_what_muster_gives_an_algorithm_of_rsl_rl_is_no_setting(store: Path, name: str) -> None:
-    with pytest.raises(UserError, match=rf"rsl_rl\.algorithm\.{name}: there is no such key"):
-        go_on(store, "rsl", with_value(PPO_RUN, f"algorithm.{name}", "cpu"))
 
 
 # -- one's own --------------------------------------------------------------------------------------------------------

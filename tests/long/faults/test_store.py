@@ -123,7 +123,7 @@ def test_a_run_that_is_deleted_while_it_trains_does_not_come_back_in_part(server
     assert not (run.path / "run.json").exists() and list_checkpoints(run) == []
 
 
-def test_a_node_that_is_told_to_leave_takes_the_gang_along_and_loses_no_iteration(server: Serving) -> None:
+def test_a_node_that_is_asked_to_leave_takes_the_gang_along_and_loses_no_iteration(server: Serving) -> None:
     """Preemption: SIGTERM to one node; all agree on an iteration, save, leave with 75, and go on from there."""
     job = submit(server, "train.iterations=100000", "checkpoint.every=100000")
     wait_for_iteration(server, job["run"], 5)

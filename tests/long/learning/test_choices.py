@@ -80,7 +80,7 @@ def test_ppo_learns_to_choose_is_killed_and_exports_what_it_learnt(directory: Pa
 @pytest.mark.parametrize(
     ("algorithm", "output"), [("sac", "this task's are choices; use ppo"), ("rsl_rl", "are choices")]
 )
-def test_who_can_not_choose_says_so_in_one_line(directory: Path, algorithm: str, output: str) -> None:
+def test_who_cannot_choose_says_so_in_one_line(directory: Path, algorithm: str, output: str) -> None:
     reported = training(directory / "store", task="pushed:Pushed", algorithm=algorithm)
     done = call_worker(worker.train.main, reported)
     (line,) = done.stderr.strip().splitlines()

@@ -1,4 +1,4 @@
-"""rsl_rl's algorithms learn on real worlds: networks with memory, symmetry, curiosity, a student from its teacher."""
+"""rsl_rl's algorithms learn on real worlds: a network with memory, symmetry, curiosity, a student from its teacher."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from rsl_rl.runners import OnPolicyRunner
 from tensordict import TensorDict
 
 from tests.support.worker.loop import groups
-from tests.support.worker.rsl_loop import GAUSSIAN, Recall, build, evaluate, train
+from tests.support.worker.rsl_loop import GAUSSIAN, build, evaluate, train
 from tests.support.worker.rsl_loop import GRU as SMALL_GRU
 from worker.learning.rsl.algorithm import RslRl
 from worker.learning.rsl.vector_environment import TaskVecEnv, make
@@ -67,25 +67,6 @@ def test_a_gru_holds_the_pole_without_seeing_velocities() -> None:
     train(algorithm, task, 50)
     mean_return, mean_length = evaluate(algorithm.policy(), task)
     assert mean_length > 295.0 and mean_return > HELD
-
-
-@pytest.mark.parametrize(("recurrent", "least", "most"), [(True, 0.9, 1.0), (False, -0.05, 0.1)])
-def test_only_a_network_with_memory_learns_what_was_said_at_the_beginning(
-    recurrent: bool, least: float, most: float
-) -> None:
-    task = Recall(64, seed=1)
-    network = {**GRU, "rnn_hidden_dim": 16} if recurrent else {"class_name": "MLPModel", "hidden_dims": [32]}
-    algorithm = learner(
-        task,
-        {
-            "num_steps_per_env": 20,
-            "actor": {**network, "distribution_cfg": GAUSSIAN},
-            "algorithm": {"entropy_coef": 0.0},
-        },
-    )
-    train(algorithm, task, 30)
-    mean_return, _ = evaluate(algorithm.policy(), task)
-    assert least <= mean_return / task.max_episode_length <= most
 
 
 def test_symmetry_makes_a_policy_that_acts_alike_on_both_sides() -> None:

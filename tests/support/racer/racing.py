@@ -37,6 +37,13 @@ def counted(task: Racer, name: str) -> float:
     return float(task.statistics[task.statistic_names.index(name)])
 
 
+def ahead(task: Racer, speed: float = 0.0) -> torch.Tensor:
+    """Actions that steer for the third point ahead."""
+    column = task.observation_names.index("waypoint_2_x")
+    x, y = task.observations[:, column], task.observations[:, column + 1]
+    return torch.stack((torch.atan2(y, x) / 0.5236, torch.full_like(x, speed)), 1)
+
+
 def straight(task: Racer, speed: float = 0.0) -> torch.Tensor:
     """Actions of cars that do not steer."""
     return torch.tensor([[0.0, speed]] * task.world_count)

@@ -34,7 +34,7 @@ _PARTS = {
 
 
 _CONNECT = "learning/distributed.py:connect"
-"""Forms the gang, and is no path to a collective for those who call it."""
+"""Forms the gang, and is not a path to a collective for those who call it."""
 
 
 class Call(NamedTuple):

@@ -1,6 +1,6 @@
 """A gang of two real ranks that plays cases: functions of a test's module that are marked ``@case``.
 
-A test of the same name judges what each rank said of its case. All share one gang, since most of the time goes into starting ranks.
+A test of the same name judges what each rank returned from its case. All share one gang, since most of the time goes into starting ranks.
 """
 
 from __future__ import annotations

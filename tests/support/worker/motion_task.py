@@ -53,7 +53,7 @@ class Turning(Small):
         return {
             "sensors": {"motion": terms.Motion(self.motion, bodies="*", anchor="base", sampling=sampling)},
             "commands": {"frame": Command(terms.motion_command, names=["frame"], seconds=99.0, update=advance)},
-            "observations": {"wanted": Observation(terms.wanted_joint_position, command="frame")},
+            "observations": {"target": Observation(terms.wanted_joint_position, command="frame")},
             "events": {},
             "terminations": {
                 "hard": Termination(hard_part, command="frame"),

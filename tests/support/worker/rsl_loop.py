@@ -137,33 +137,6 @@ class Batched(MLPModel):
         self.mlp = nn.Sequential(nn.BatchNorm1d(self.obs_dim), self.mlp)  # type: ignore[assignment]  # rsl_rl wants its own MLP
 
 
-class Recall(GroupedPoint):
-    """Only an episode's first observation says which way to push in all of its 20 steps: without memory the mean reward is 0.05 at most."""
-
-    def __init__(self, world_count: int, *, seed: int = 0) -> None:
-        super().__init__(PointConfig(), world_count, seed=seed)
-        self.cue = self.place.sign()
-        self.reported = self.cue.clone().unsqueeze(1)
-        self.groups = {"policy": self.reported, "critic": self.cue.view(-1, 1)}
-        self.terminal_groups = {}
-
-    def reset(self) -> None:
-        super().reset()
-        if hasattr(self, "cue"):
-            self._report()
-
-    def step(self, actions: torch.Tensor) -> None:
-        reward = actions[:, 0].clamp(-1.0, 1.0) * self.cue
-        super().step(torch.zeros_like(actions))
-        self.rewards.copy_(reward)
-        self._report()
-
-    def _report(self) -> None:
-        """The point stands still, and where it stands is drawn anew at a reset."""
-        self.cue.copy_(self.place.sign())
-        self.reported[:, 0] = torch.where(self.episode_length == 0, self.cue, 0.0)
-
-
 def mirror(env: Any, obs: TensorDict | None, actions: torch.Tensor | None) -> tuple[Any, Any]:
     """A symmetry function: left and right of the cart-pole, and of the point, are the same but for the sign."""
     both = None

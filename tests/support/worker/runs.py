@@ -1,4 +1,4 @@
-"""Trainings, of :class:`tests.support.worker.point_task.Point` unless said otherwise, in the test's own process, and the bits that they end with."""
+"""Trainings, of :class:`tests.support.worker.point_task.Point` unless a test names another task, in the test's own process, and the bits that they end with."""
 
 from __future__ import annotations
 

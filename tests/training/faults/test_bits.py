@@ -127,10 +127,7 @@ def test_stopped_and_resumed_ends_with_the_same_bits(home: Path, straight: str) 
 @pytest.mark.parametrize(
     ("arguments", "part"),
     [
-        (
-            ["job_specs/all-reduce.yaml", "--at", "3"],
-            "all-reduce.yaml: verify-resume needs a job that trains; this is a command job",
-        ),
+        (["job_specs/all-reduce.yaml", "--at", "3"], "verify-resume needs a job that trains; this is a command"),
         (["job_specs/cartpole.yaml", "--at", "0"], "--at 0: expected an iteration, from 1"),
         (["job_specs/cartpole.yaml", "--at", "7", "--iterations", "0"], "at least one iteration must follow --at 7"),
         (["nowhere.yaml", "--at", "3"], "nowhere.yaml: No such file"),

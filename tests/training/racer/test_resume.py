@@ -16,12 +16,13 @@ SETTINGS: Settings = {
         "alternate_direction": True,
         "speed_factor": [0.8, 1.2],
         "obstacles": [{"distance": 3.0}],
+        "continuous": True,
         "randomize": {"action_latency": 2},
     },
     "RacerPixels": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24, "frames": 2}},
     "RacerPixelsAndState": {"episode_seconds": 2.0, "front": {"width": 32, "height": 24}},
 }
-"""Episodes are short, so that there are resets before and after each point."""
+"""Episodes are short, for resets before and after each point."""
 
 
 def test_a_fresh_process_goes_on_bit_for_bit(tmp_path: Path) -> None:

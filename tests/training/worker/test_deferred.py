@@ -1,4 +1,4 @@
-"""What a rank and the command start without: torch's compiler, which is there as soon as somebody wants it, and Rerun."""
+"""What a rank and the command start without: torch's compiler, which is available as soon as something needs it, and Rerun."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ from tests.support.worker.loop import iterate, setting_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from tests.support.worker.ranks import ROOT, free_port, run_ranks, start_rank, training
 from worker.learning.algorithm import WorldShare
-from worker.learning.distributed import Gang, RankPlacement, _listen, connect, require_gpus, warm_marker
+from worker.learning.distributed import Gang, RankPlacement, _listen, connect, require_gpus
 from worker.learning.ppo.fused import PPO
 from worker.settings.errors import GangError
 
@@ -115,7 +115,7 @@ def test_a_missing_main_rank_is_named() -> None:
 MAIN_RANK_ENDED = "error: the main rank ended or did not answer in time; its log gives the reason"
 
 
-def test_ranks_whose_main_rank_ends_at_the_resume_say_so_in_one_line(tmp_path: Path) -> None:
+def test_ranks_whose_main_rank_ends_at_the_resume_report_it_in_one_line(tmp_path: Path) -> None:
     raise_epoch(Store(tmp_path).run("run"), 2)
     (main, _, reason), (other, _, errors) = run_ranks("train", 2, training(tmp_path, epoch=1))
     assert main == other == 1 and "now belongs to epoch 2" in reason
@@ -132,7 +132,7 @@ def end_while_building() -> int:
     return 0
 
 
-def test_a_rank_whose_main_rank_ends_while_it_builds_says_so_in_one_line() -> None:
+def test_a_rank_whose_main_rank_ends_while_it_builds_reports_it_in_one_line() -> None:
     _, (code, _, errors) = run_ranks("training.worker.test_distributed:end_while_building", 2)
     assert code == 1 and MAIN_RANK_ENDED in errors
     assert "Traceback" not in errors
@@ -210,16 +210,6 @@ def test_no_rank_waits_for_a_warm_cache_or_for_another_hosts(tmp_path: Path, war
     sites = ["a:cache", "a:cache" if warm else "b:cache"]
     events = build(tmp_path if warm else tmp_path / "cold", sites, is_taken_in_turn=False)
     assert [kind for kind, _ in events] == ["start", "start", "end", "end"]
-
-
-def test_the_warm_marker_depends_on_the_task_and_lives_in_the_cache(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path))
-    first, second = warm_marker(Gang, "cpu"), warm_marker(RankPlacement, "cpu")
-    assert first and second and first != second and first.parent.parent == tmp_path
-    monkeypatch.delenv("WARP_CACHE_PATH")
-    assert warm_marker(Gang, "cpu") is None
 
 
 @pytest.mark.parametrize(

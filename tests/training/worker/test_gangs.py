@@ -40,7 +40,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def played(store: Path) -> Played:
-    """What each rank said of each case, by its name."""
+    """What each rank returned from each case, by its name."""
     return play_cases("training.worker.test_gangs", training(store))
 
 
@@ -148,7 +148,7 @@ def an_evaluation_that_one_rank_is_requested_to_leave_ends_on_all(gang: Gang, st
     play([Point(PointConfig(episode_seconds=5.0), 3)], Still(), gang, is_stop_requested=lambda: gang.rank == 1)
 
 
-def test_an_evaluation_that_one_rank_is_asked_to_leave_ends_on_all(reported: list[Any]) -> None:
+def test_an_evaluation_that_one_rank_is_requested_to_leave_ends_on_all(reported: list[Any]) -> None:
     assert reported == ["Stopped: "] * 2
 
 
@@ -195,12 +195,12 @@ def test_a_clone_begins_with_the_same_weights_on_all_ranks(reported: list[Any], 
 
 
 @case
-def a_clone_owner_weights_are_gone_is_refused_by_all_ranks(gang: Gang, store: Path) -> Any:
+def a_clone_without_its_weights_is_refused_by_all_ranks(gang: Gang, store: Path) -> Any:
     started(gang, Store(store).run("orphan"))
     runner(training(store, run="orphan", MUSTER_PARENT="taught"), gang)
 
 
-def test_a_clone_whose_weights_are_gone_is_refused_by_all_ranks(reported: list[Any]) -> None:
+def test_a_clone_without_its_weights_is_refused_by_all_ranks(reported: list[Any]) -> None:
     assert reported[0] == reported[1] and reported[0].startswith(
         "UserError: run orphan can't begin with the weights of taught"
     )

@@ -44,7 +44,7 @@ def test_an_observation_that_is_not_finite_is_hidden_and_its_world_reset_in_the_
     assert all(torch.equal(tensor, after[name]) for name, tensor in task.state_dict().items())
 
 
-def test_physics_and_rewards_are_named_too_and_the_first_world_is_told() -> None:
+def test_physics_and_rewards_are_named_too_and_the_first_world_is_reported() -> None:
     task = Cartpole(CartpoleConfig(rewards={"velocity": -1e38}), 4, seed=1)
     put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0], [900.0, 0.0], [0.0, 0.0], [math.nan, 0.0]])
     task.step(STILL)
@@ -139,7 +139,7 @@ def test_the_reward_term_that_is_not_finite_is_named_at_the_end_and_in_the_repla
     assert terms <= {"alive 1, rotten nan, fall 0", "alive 0, rotten nan, fall -2"} and terms
 
 
-def test_a_file_that_is_no_incident_is_refused_in_one_line(tmp_path: Path) -> None:
+def test_a_file_other_than_an_incident_is_refused_in_one_line(tmp_path: Path) -> None:
     (tmp_path / "nonsense").write_text("x")
     (tmp_path / "empty").touch()
     for name, says in {"nonsense": "holds no", "missing": "can't be read (", "empty": "holds no"}.items():

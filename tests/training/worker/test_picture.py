@@ -11,8 +11,7 @@ from PIL import Image
 
 from worker.settings.cartpole import CartpoleConfig
 from worker.tasks.library.cartpole import Cartpole
-from worker.telemetry.messages import tiled
-from worker.telemetry.picture import STRIP, EpisodePicture, StageCamera, encode, pace
+from worker.telemetry.picture import EpisodePicture, StageCamera, encode, pace
 from worker.telemetry.stage import Stage
 
 torch.set_num_threads(1)
@@ -52,14 +51,6 @@ def test_the_camera_follows_the_robot(camera: StageCamera) -> None:
     far = camera.take(np.array([[1.5, 0.0], [-1.5, 0.0]], np.float32))
     for tile in (far[:, :80], far[:, 80:]):
         assert 25 < np.argwhere(blue(tile))[:, 1].mean() < 55
-
-
-def test_a_strip_shows_its_pictures_row_by_row() -> None:
-    pictures = [np.full((4, 6, 3), value, np.uint8) for value in range(6)]
-    whole = tiled(pictures, *STRIP)
-    assert whole.shape == (2 * 4 + 2, 3 * 6 + 2 * 2, 3)
-    assert whole[0, [0, 8, 16], 0].tolist() == [0, 1, 2] and whole[6, [0, 8, 16], 0].tolist() == [3, 4, 5]
-    assert (whole[4:6] == 255).all()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.layout import Store
 from tests.support.refusals import refusal
 from tests.support.worker.ranks import training
-from tests.support.worker.runs import assert_same_bits, last, runner, train
+from tests.support.worker.runs import assert_same_bits, last, train
 from tests.support.worker.tasks import put
 from worker.export import export
 from worker.learning.job import configure
@@ -84,13 +84,3 @@ def test_a_run_resumes_with_the_same_bits_and_its_policy_can_be_exported(tmp_pat
     kind = graph.input[0].type.tensor_type
     assert kind.elem_type == onnx.TensorProto.UINT8
     assert [axis.dim_value for axis in kind.shape.dim][1:] == [6, 64, 64]
-
-
-@pytest.mark.parametrize(
-    ("ppo", "camera"), [({}, {"width": 32, "height": 32}), ({}, {"height": 16}), ({"strides": [8, 8, 8]}, {})]
-)
-def test_an_image_of_which_the_convolutions_leave_nothing_is_refused(tmp_path: Path, ppo: dict, camera: dict) -> None:
-    env = training(tmp_path, worlds=4, task="CartpolePixels", config={"camera": camera}, ppo=ppo)
-    output = r"ppo: convolution \d has a kernel of \d and a stride of \d, but \d+ x \d+ px are left"
-    with pytest.raises(UserError, match=output):
-        runner(env, task=CartpolePixels)

@@ -130,7 +130,7 @@ def test_the_node_sees_a_camera_s_images_as_the_task_does() -> None:
     assert assert_sees_what_the_task_sees(wired, 30, 1.0) >= 2
 
 
-def test_a_bundle_whose_task_means_something_else_by_now_is_no_simulated_robot(
+def test_a_bundle_whose_task_has_changed_is_refused_as_a_simulated_robot(
     exported: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import worker.tasks.run.policy_contract as contracts

@@ -200,10 +200,7 @@ def test_a_state_brings_the_physics_of_its_worlds_also_that_of_an_older_version(
         ({"mass": [2, 1]}, ".mass: expected [least, greatest], two factors above 0, found [2, 1]"),
         ({"gains": [-1, 1]}, ".gains: expected [least, greatest], two factors of 0 or more"),
         ({"friction": [0, math.inf]}, ".friction: expected [least, greatest], two factors"),
-        (
-            {"friction": [0, "much"]},
-            ".friction: expected [least, greatest], two factors of 0 or more, found [0, 'much']",
-        ),
+        ({"friction": [0, "much"]}, ".friction: expected [least, greatest], two factors of 0 or more"),
         ({"observation_noise": -1}, ".observation_noise: expected a number of 0 or more, found -1"),
         ({"action_latency": 100}, ".action_latency: expected a value less than or equal to 64, found 100"),
     ],

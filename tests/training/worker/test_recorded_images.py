@@ -1,4 +1,4 @@
-"""Images of a training that runs: what a recording and the live view have of them is what its worlds' cameras saw, byte for byte."""
+"""Images of a training that runs: what a recording has of them is what its worlds' cameras saw, byte for byte. The live view: test_view.py."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import io
 import json
 import threading
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 
@@ -23,8 +22,6 @@ from worker.learning.reporter import Gate
 from worker.settings.overrides import configured
 from worker.tasks.library.cartpole_pixels import CartpolePixels
 from worker.telemetry.live_recording import record
-from worker.telemetry.live_view import TrainingView
-from worker.telemetry.progress import Activity
 from worker.telemetry.rows import Layout
 from worker.telemetry.tap import LiveTap, Tap, TapReader
 
@@ -95,39 +92,6 @@ def test_a_recorded_training_has_the_images_of_each_step(running: Running, tmp_p
         for step, image in zip(steps, images, strict=True):
             np.testing.assert_array_equal(image, running.newest(step, int(world)))
     assert len({image.tobytes() for image in found["0"]}) > 5, "the camera sees the cart move"
-
-
-class File(AbstractContextManager):
-    """In place of the page: Rerun's stream goes into a file; after some frames the user ends the view."""
-
-    def __init__(self, server: Path, stop: list[int]) -> None:
-        self.server, self._stop, self._left = server, stop, 40
-
-    def check(self) -> None:
-        self._left -= 1
-        if not self._left:
-            self._stop.append(2)
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
-
-def test_the_live_view_of_a_training_shows_them_beside_each_other(running: Running, tmp_path: Path) -> None:
-    from rerun.chunk import RrdReader
-
-    stop: list[int] = []
-    view = TrainingView(running.run, "job", 2, stop, Activity())
-    view.show(lambda: File(tmp_path / "view.rrd", stop))
-    assert view.frames > 3
-    shown: list[np.ndarray] = []
-    for chunk in RrdReader(tmp_path / "view.rrd").stream().to_chunks():
-        if chunk.entity_path == "/images/policy":
-            blobs = chunk.to_record_batch()["EncodedImage:blob"].to_pylist()
-            shown += [np.asarray(Image.open(io.BytesIO(bytes(blob[0])))) for blob in blobs]
-    assert len(shown) == view.frames
-    steps = range(len(running.seen))
-    both = {np.hstack([running.newest(step, world) for world in (0, 1)]).tobytes() for step in steps}
-    assert all(picture.shape == (8, 24, 3) and picture.tobytes() in both for picture in shown)
 
 
 def test_images_that_are_too_large_are_left_out_and_one_line_says_so(

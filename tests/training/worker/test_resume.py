@@ -29,7 +29,7 @@ SETTINGS: Settings = {
         },
     },
 }
-"""Episodes and commands are short, so that there are resets and new commands before and after each point."""
+"""Episodes and commands are short, for resets and new commands before and after each point."""
 
 
 def test_every_built_in_task_is_tested() -> None:

@@ -31,7 +31,7 @@ PIPE = 4096
 
 @contextmanager
 def hanging_metrics(run: Run) -> Iterator[int]:
-    """A metrics file that blocks whoever writes to it until somebody reads from the descriptor: a pipe."""
+    """A metrics file that blocks whoever writes to it until someone reads from the descriptor: a pipe."""
     run.metrics.mkdir(parents=True)
     path = run.metrics / "metrics-e1.jsonl"
     os.mkfifo(path)
@@ -121,7 +121,7 @@ def test_a_stop_in_a_long_iteration_loses_that_iteration_alone(tmp_path: Path, r
 
 
 def stopped_after(ranks: list[subprocess.Popen[str]], iteration: int) -> str:
-    """Ask all ranks to stop when the first one has told of an iteration; the first one's output."""
+    """Ask all ranks to stop when the first one has reported an iteration; the first one's output."""
     try:
         assert ranks[0].stdout
         output = []

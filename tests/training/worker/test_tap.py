@@ -103,7 +103,7 @@ def test_the_worlds_do_not_notice_that_they_are_watched() -> None:
 
 
 @pytest.mark.parametrize("worlds", [0, 7])
-def test_worlds_that_do_not_exist_can_not_be_watched(task: Cartpole, worlds: int) -> None:
+def test_worlds_that_do_not_exist_cannot_be_watched(task: Cartpole, worlds: int) -> None:
     with pytest.raises(ValueError, match=f"worlds is {worlds}; of these worlds 1 to 6 can be watched"):
         Tap(task, worlds)
 
@@ -118,7 +118,7 @@ def numbered(first: int, count: int) -> Rows:
 
 
 def steps(segment: Segment) -> tuple[list[int], int]:
-    """Numbers of the steps that are read, and how many are said to be lost."""
+    """Numbers of the steps that are read, and how many are reported as lost."""
     found = list(segment.take())
     for rows in found:
         assert (rows.values == np.arange(rows.first, rows.first + len(rows))[:, None, None]).all()

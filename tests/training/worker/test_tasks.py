@@ -13,13 +13,11 @@ import warp as wp
 
 import worker.tasks.library.cartpole as cartpole_module
 from tests.support.worker.tasks import observe, play, put, same, statistics
-from worker.simulation.episodes import STEP
 from worker.tasks import find_task
 from worker.tasks.library.ant import Ant, AntConfig
 from worker.tasks.library.cartpole import Cartpole, CartpoleConfig
 from worker.tasks.library.humanoid import Humanoid, HumanoidConfig
 from worker.tasks.library.quadruped import Quadruped
-from worker.tasks.run.control_step import ControlStep
 from worker.tasks.run.task import Task
 
 torch.set_num_threads(1)
@@ -174,13 +172,6 @@ def test_a_task_without_reward_terms_is_refused() -> None:
         unrewarded(unrewarded.config_type(), 2)
 
 
-def test_a_step_that_replays_nothing_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    judge = ControlStep._judge
-    monkeypatch.setattr(ControlStep, "_judge", lambda self, mode: mode == STEP or judge(self, mode))
-    with pytest.raises(RuntimeError, match="the captured step of task Cartpole does not replay on cpu"):
-        Cartpole(CartpoleConfig(), 2)
-
-
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 @pytest.mark.parametrize("task_type", [Cartpole, Ant, Humanoid, Quadruped])
 def test_on_a_gpu_a_step_is_one_graph_and_fits_into_a_larger_one(task_type: type[Task]) -> None:
@@ -241,17 +232,3 @@ def test_a_module_that_exits_ends_nothing_but_the_search_for_its_task(
     monkeypatch.syspath_prepend(str(tmp_path))
     with pytest.raises(ValueError, match=r"^task 'exiting:Task': exiting exits when it is imported \(code 3\)$"):
         find_task("exiting:Task")
-
-
-@pytest.mark.parametrize(
-    ("config", "arguments", "message"),
-    [
-        (CartpoleConfig(), {"world_count": 0}, "at least 1"),
-        (CartpoleConfig(), {"seed": -1}, "seed is -1"),
-        (CartpoleConfig(), {"first_world": -1}, "first_world is -1"),
-        (AntConfig(), {}, "takes a CartpoleConfig, not a AntConfig"),
-    ],
-)
-def test_impossible_arguments_are_refused_in_one_sentence(config: object, arguments: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Cartpole(config, **{"world_count": 2, **arguments})

@@ -1,29 +1,26 @@
 """W&B and MLflow for real: a training that is killed and goes on, one without a key, one whose server is away.
 
-W&B offline, whose files are read again; MLflow on a database file, and over HTTP with its own server. Both packages are extras:
+W&B offline, whose files are read again; MLflow on a database file. Both packages are extras:
 `make services` installs them.
 """
 
 from __future__ import annotations
 
 import contextlib
-import importlib
 import json
 import os
-import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.layout import Run, Store
 from shared_store.volume.metrics import read_metrics
-from tests.conftest import PATIENCE, wait_for
+from tests.conftest import PATIENCE
 from tests.support.worker.ranks import ROOT, free_port, placement
 from tests.support.worker.wandb_files import history, records
 from worker.telemetry.services import MLflow, Tracked
@@ -115,54 +112,6 @@ def test_a_training_that_was_killed_and_goes_on_is_one_run_of_each_service_with_
     assert config["train"] == TRAIN and config["run"] == "taught" and "newton" in config["versions"]
     saved = {each.path for record in records(file) if record.HasField("files") for each in record.files.files}
     assert {"reward.png", "00000040-e2.json"} <= saved
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[str]:
-    """MLflow's own server, with a database file and a directory of artifacts; its address."""
-    pytest.importorskip("mlflow", reason="pip install 'muster[mlflow]', or make services")
-    pytest.importorskip("flask", reason="of the extra dev, with which the server runs")
-    pytest.importorskip("pandas", reason="which the server imports: make services")
-    port = free_port()
-    url = f"http://127.0.0.1:{port}"
-    command = [sys.executable, "-m", "mlflow", "server", "--host", "127.0.0.1", "--port", str(port), "--workers", "1"]
-    places = [f"--backend-store-uri=sqlite:///{tmp_path}/served.db", f"--artifacts-destination={tmp_path}/artifacts"]
-    with open(tmp_path / "server.log", "wb") as log:
-        process = subprocess.Popen(
-            command + places,
-            # its scheduler of jobs, which no tracking needs, would want the whole package
-            env={**os.environ, "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false"},
-            cwd=tmp_path,
-            stdout=log,
-            stderr=log,
-            start_new_session=True,
-        )
-
-    def answers() -> bool:
-        assert process.poll() is None, (tmp_path / "server.log").read_text()
-        try:
-            return httpx.get(f"{url}/health", trust_env=False).is_success
-        except httpx.TransportError:
-            return False
-
-    try:
-        wait_for(answers, 120, "MLflow's server")
-        yield url
-    finally:
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-
-
-def test_over_http_a_training_that_was_killed_and_goes_on_is_one_run_of_mlflow_s_server(run: Run, server: str) -> None:
-    expected = killed_and_gone_on(run, {"mlflow": {"uri": server, "experiment": "poles"}})
-    client = importlib.import_module("mlflow").MlflowClient(server)
-    [existing] = client.search_runs([client.get_experiment_by_name("poles").experiment_id])
-    assert existing.info.status == "FINISHED" and existing.info.run_name == "taught"
-    for name, key in (("train/env_steps", "env_steps"), ("train/kl", "kl")):
-        reported = client.get_metric_history(existing.info.run_id, name)
-        assert [(each.step, each.value) for each in reported] == [(each["iteration"], each[key]) for each in expected]
-    assert {each.path for each in client.list_artifacts(existing.info.run_id)} == {"reward.png", "00000040-e2.json"}
-    assert len(list((run.path.parent.parent.parent / "artifacts").rglob("reward.png"))) == 1, "sent through the server"
 
 
 def test_a_kill_while_mlflow_s_run_is_made_costs_it_no_parameter(tmp_path: Path) -> None:

@@ -87,7 +87,7 @@ def test_a_recording_of_another_program_is_refused_in_one_line(tmp_path: Path) -
         writer.add_message(writer.register_channel("/tf_static", "cdr", schema), 1, b"\0\1\0\0\xff\xff\0\0", 1)
         writer.finish()
     output = refusal(Replay, path, error=UserError)
-    assert "it is no recording of Muster's, whose topics have other messages" in output
+    assert "it is not a recording of Muster's: its topics have other messages" in output
 
 
 def test_every_link_of_every_world_is_where_the_simulation_has_it(recorded: Recorded, shown: dict[str, Any]) -> None:

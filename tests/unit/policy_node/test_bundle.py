@@ -42,7 +42,7 @@ def flipped(path: Path) -> None:
     path.write_bytes(bytes(data))
 
 
-def test_a_bundle_passes_its_self_test_and_shows_its_joints_unless_the_domain_is_no_number(
+def test_a_bundle_passes_its_self_test_and_shows_its_joints_unless_the_domain_is_not_a_number(
     bundle: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert main([str(bundle), "--check"]) == 0
@@ -69,10 +69,7 @@ def test_a_recurrent_policy_is_tested_over_the_steps_of_its_recording(tmp_path: 
         (lambda path: (path / "policy.onnx").write_bytes(b"x"), "policy.onnx has 1 bytes"),
         (lambda path: (path / "policy.onnx").unlink(), "policy.onnx is missing; copy the bundle once more"),
         (lambda path: (path / "more.py").write_text("x"), "more.py was added, manifest.json does not list it"),
-        (
-            lambda path: (path / "manifest.json").unlink(),
-            "manifest.json is missing; name a bundle that `muster export` made",
-        ),
+        (lambda path: (path / "manifest.json").unlink(), "manifest.json is missing; name a bundle"),
         (lambda path: (path / "manifest.json").write_text("[]"), "manifest.json is not a bundle's manifest"),
         (
             lambda path: (path / "manifest.json").write_text(
@@ -114,7 +111,7 @@ UNREADABLE = {
     "has format 9, this node reads up to 4; upgrade muster-policy": lambda found: found.update(format=9),
     "actions is missing; export the policy again": lambda found: found.pop("actions"),
     "control_hz is 0; export the policy again": lambda found: found.update(control_hz=0),
-    "it is no policy contract": lambda found: found.update(groups=7),
+    "it is not a policy contract": lambda found: found.update(groups=7),
     "the terms of policy have 2 numbers, its shape is [3]": lambda found: found["groups"][0].update(shape=[3]),
 }
 
@@ -146,7 +143,7 @@ def test_a_policy_of_other_inputs_than_the_contract_s_is_refused(bundle: Path, t
     with pytest.raises(Refused, match=r"policy\.onnx takes \{'obs': \(4,\)\}, contract\.json says \{'obs': \(2,\)\}"):
         Policy(open_bundle(bundle))
     resealed(bundle, lambda path: (path / "policy.onnx").write_bytes(b"no model") and None)
-    with pytest.raises(Refused, match=r"policy\.onnx is no ONNX file"):
+    with pytest.raises(Refused, match=r"policy\.onnx is not an ONNX file"):
         open_bundle(bundle)
     resealed(
         bundle,

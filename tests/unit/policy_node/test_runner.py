@@ -167,7 +167,7 @@ def test_each_kind_of_command_is_a_message_of_its_own_with_the_robot_s_names() -
 
 SLOW = Action("knee", "position", "rad", 1.0, 0.0, rule="It follows value slowly.")
 NO_JOINTS = {
-    "does not say what its actions are: left, right": {
+    "what its actions are: left, right": {
         "actions": (),
         "action_names": ("left", "right"),
         "discrete": True,

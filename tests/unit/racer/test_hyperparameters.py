@@ -1,4 +1,4 @@
-"""DeepRacer's hyperparameters in a job's YAML: which settings they become, what is said of them, and what is refused."""
+"""DeepRacer's hyperparameters in a job's YAML: which settings they become, the notes on them, and what is refused."""
 
 from __future__ import annotations
 
@@ -51,13 +51,6 @@ def test_a_usual_file_becomes_settings_of_ppo() -> None:
     unused = {"e_greedy_value", "epsilon_steps", "term_cond_avg_score", "term_cond_max_episodes", "sac_alpha"}
     close = {"batch_size", "loss_type", "num_episodes_between_training"}
     assert output.keys() == {f"hyperparameters.{name}" for name in unused | close}
-
-
-def test_a_usual_file_becomes_settings_of_sac() -> None:
-    spec = job(USUAL, algorithm="sac")
-    assert spec.train is not None
-    rates = dict.fromkeys(("actor_learning_rate", "critic_learning_rate", "temperature_learning_rate"), 0.0003)
-    assert spec.train.overrides() == {"batch_size": 64, "gamma": 0.99, "init_temperature": 0.2, **rates}
 
 
 OF_SAC = {

@@ -52,7 +52,7 @@ def modules(package: str) -> list[Path]:
     return [REPOSITORY / line for line in found.stdout.splitlines() if (REPOSITORY / line).is_file()]
 
 
-def test_the_page_lists_modules_that_there_are() -> None:
+def test_the_page_lists_existing_modules() -> None:
     assert len(PUBLIC) > 50
     assert [name for name in sorted(PUBLIC) if not is_module(name)] == []
 

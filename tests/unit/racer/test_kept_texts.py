@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from racer.rewards.reward_file import RewardFile, reward_file
-from shared_store.volume import texts
 from shared_store.volume.layout import Store
 from shared_store.volume.texts import digest_of
 from tests.support.refusals import refusal
@@ -27,14 +26,6 @@ def environment(store: Path, kind: str) -> dict[str, str]:
     return {"MUSTER_STORE": str(store), "MUSTER_RUN": "line", "MUSTER_EPOCH": "1", "MUSTER_SPEC": json.dumps(spec)}
 
 
-@pytest.mark.parametrize("kind", ["train", "evaluate", "race"])
-def test_a_rank_has_the_text_and_its_spec_the_digest(tmp_path: Path, kind: str) -> None:
-    texts.keep(Store(tmp_path).run("line").texts, TEXT.encode())
-    job = Job.from_env(environment(tmp_path, kind), kind)
-    assert job.section["config"] == {"track": "oval", "reward_function": {"file": "mine.py", "text": TEXT}}
-    assert job.spec[kind]["config"]["reward_function"] == REFERENCE
-
-
 def test_a_rank_refuses_a_text_that_is_missing_or_altered(tmp_path: Path) -> None:
     path = Store(tmp_path).run("line").texts / REFERENCE["sha256"]
     begins = f"train.config.reward_function: mine.py (sha256 {REFERENCE['sha256']}): the text kept at {path} is "
@@ -46,7 +37,7 @@ def test_a_rank_refuses_a_text_that_is_missing_or_altered(tmp_path: Path) -> Non
     assert found == f"{begins}altered: its content has another digest; submit the job again with the file"
 
 
-def test_a_digest_alone_is_no_reward_function_that_could_be_run() -> None:
+def test_a_digest_alone_is_not_a_reward_function_that_could_be_run() -> None:
     with pytest.raises(
         Refused, match=r"mine\.py: its text, with sha256 .*, is kept beside a job; name the file itself"
     ):

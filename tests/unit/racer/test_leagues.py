@@ -250,7 +250,7 @@ def test_an_evaluation_of_other_rules_is_not_of_the_league(changes: dict[str, An
     assert league().misfit(summary(race([12.0, 12.5, 13.0])) | changes) == output
 
 
-def test_the_tracks_of_a_league_can_not_change(store: Store) -> None:
+def test_the_tracks_of_a_league_cannot_change(store: Store) -> None:
     assert leagues.digest_of_track(store, "oval") is None and leagues.digest_of_track(store, "random:7") is None
     with pytest.raises(LeagueError, match=r"^track ovel does not exist; did you mean oval\?$"):
         leagues.digest_of_track(store, "ovel")

@@ -44,5 +44,5 @@ def test_the_check_of_a_reward_function_runs_by_its_old_name(tmp_path: Path) -> 
 
 def test_the_rank_of_a_race_that_was_submitted_before_runs_by_its_old_name() -> None:
     done, now = run("worker.race"), run("racer.race")
-    assert done.returncode == now.returncode != 0 and done.stderr == now.stderr, "it is no job"
+    assert done.returncode == now.returncode != 0 and done.stderr == now.stderr, "it is not a job"
     assert "MUSTER_" in now.stderr, now.stderr

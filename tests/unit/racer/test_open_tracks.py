@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from racer.car.scenery import _roads, _strip
@@ -25,7 +24,7 @@ from racer.tracks.picture import picture_of
 from racer.tracks.race_track import Track
 from racer.tracks.route_file import from_bytes, to_bytes
 from shared_store.volume.layout import Store
-from tests.support.racer.racing import OVAL, known, open_track, straight
+from tests.support.racer.racing import OVAL, ahead, counted, known, open_track, straight
 from tests.support.refusals import refusal
 
 HORSESHOE = open_track()
@@ -43,13 +42,6 @@ def store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Store:
 
 def driver(worlds: int = 1, **fields: Any) -> Racer:
     return Racer(RacerConfig(track="horseshoe", start=fields.pop("start", "line"), **fields), worlds, seed=3)
-
-
-def ahead(task: Racer, speed: float = 0.0) -> torch.Tensor:
-    """Actions that steer for the third point ahead."""
-    column = task.observation_names.index("waypoint_2_x")
-    x, y = task.observations[:, column], task.observations[:, column + 1]
-    return torch.stack((torch.atan2(y, x) / 0.5236, torch.full_like(x, speed)), 1)
 
 
 def file(rows: np.ndarray) -> bytes:
@@ -82,7 +74,7 @@ def test_an_open_track_comes_back_from_its_file_with_its_borders_the_right_way()
     assert twice.track.digest == HORSESHOE.digest and twice.notes[1].startswith("left out 80 rows")
 
 
-def test_a_loop_of_which_the_last_rows_are_missing_is_no_open_track() -> None:
+def test_a_loop_of_which_the_last_rows_are_missing_is_not_an_open_track() -> None:
     words = refusal(from_bytes, file(OVAL.rows()[:-4]), "x", error=BadTrack)
     assert (
         words.startswith("the centre line is open: 0.6") and "the last row of a loop has to be the first one" in words
@@ -94,7 +86,7 @@ def test_a_loop_of_which_the_last_rows_are_missing_is_no_open_track() -> None:
     assert "has its inner border on the left" in refusal(Track, "x", **sides, closed=False, error=BadTrack)
 
 
-def test_a_coarse_loop_without_its_closing_row_is_no_open_track() -> None:
+def test_a_coarse_loop_without_its_closing_row_is_not_an_open_track() -> None:
     turn = 2 * np.pi * np.arange(24) / 24
     ring = np.stack((np.cos(turn), np.sin(turn)), -1)
     rows = np.hstack((4.0 * ring, 3.7 * ring, 4.3 * ring))  # its steps are longer than its road is wide
@@ -150,9 +142,8 @@ def test_a_car_drives_from_the_start_to_the_end_which_completes_its_lap() -> Non
         earned, steps = earned + task.rewards[0].item(), steps + 1
         progress.append(known(task, "trace")[0, 6])
     assert progress[0] < 1.0 and np.diff(progress).min() >= 0 and progress[-1] == 100.0 and progress[-2] < 100.0
-    statistic = dict(zip(task.statistic_names, task.statistics.tolist(), strict=True))
-    assert statistic["termination_lap_complete"] == 1 and statistic["termination_off_track"] == 0
-    assert statistic["metric_lap_time"] == pytest.approx(steps / 15, rel=1e-5)
+    assert counted(task, "termination_lap_complete") == 1 and counted(task, "termination_off_track") == 0
+    assert counted(task, "metric_lap_time") == pytest.approx(steps / 15, rel=1e-5)
     assert earned == pytest.approx(100 * (END - 0.29) / END, abs=0.1)
     assert known(task, "along")[0] < 0.5  # the next episode begins at the start
 
@@ -169,15 +160,14 @@ def test_an_episode_that_begins_farther_on_makes_a_lap_of_the_rest_and_no_lap_ti
         done |= task.dones.numpy().astype(bool)
         if done.all():
             break
-    statistic = dict(zip(task.statistic_names, task.statistics.tolist(), strict=True))
-    assert done.all() and statistic["termination_lap_complete"] == statistic["episodes"]
-    assert statistic["metric_progress"] == pytest.approx(100 * statistic["episodes"])
+    assert done.all() and counted(task, "termination_lap_complete") == counted(task, "episodes")
+    assert counted(task, "metric_progress") == pytest.approx(100 * counted(task, "episodes"))
     alone = driver(start="line")
     length = 0
     while not alone.dones[0]:
         alone.step(ahead(alone))
         length += 1
-    assert statistic["metric_lap_time"] == pytest.approx(length / 15, rel=1e-4)  # that of the one from the line
+    assert counted(task, "metric_lap_time") == pytest.approx(length / 15, rel=1e-4)  # that of the one from the line
 
 
 def test_every_other_episode_drives_back_from_the_end() -> None:
@@ -188,8 +178,7 @@ def test_every_other_episode_drives_back_from_the_end() -> None:
         task.step(ahead(task))
         while not task.dones[0]:
             task.step(ahead(task))
-    statistic = dict(zip(task.statistic_names, task.statistics.tolist(), strict=True))
-    assert statistic["termination_lap_complete"] == 2
+    assert counted(task, "termination_lap_complete") == 2
     assert [each[0] for each in seen] == [False, True]
     np.testing.assert_allclose(seen[1][1], HORSESHOE.center[-1] + [0.29, 0], atol=1e-3)
 
@@ -247,7 +236,7 @@ def test_a_car_is_put_back_onto_the_road_and_not_before_its_start() -> None:
     np.testing.assert_allclose(known(task, "poses")[0], [*(HORSESHOE.center[0] + [0.15, 0]), 0.0], atol=1e-3)
     while not task.dones[0]:
         task.step(ahead(task))
-    assert dict(zip(task.statistic_names, task.statistics.tolist(), strict=True))["termination_lap_complete"] == 1
+    assert counted(task, "termination_lap_complete") == 1
 
 
 def test_a_fast_car_that_passes_the_end_is_not_off_the_track() -> None:
@@ -256,8 +245,7 @@ def test_a_fast_car_that_passes_the_end_is_not_off_the_track() -> None:
     task = driver(64, start="random", start_sideways=(-0.05, 0.05), action_space=space, speed_lag=0.0)
     for _ in range(40):
         task.step(ahead(task, 1.0))
-    statistic = dict(zip(task.statistic_names, task.statistics.tolist(), strict=True))
-    assert statistic["termination_lap_complete"] > 30 and statistic["termination_off_track"] == 0
+    assert counted(task, "termination_lap_complete") > 30 and counted(task, "termination_off_track") == 0
 
 
 def test_an_open_track_is_drawn_and_seen_without_a_piece_that_closes_it() -> None:

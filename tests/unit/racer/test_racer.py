@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from typing import Any
 
@@ -13,11 +12,8 @@ import torch
 from orchestrator.spec.model import validate
 from racer.car.task import Racer, RacerPixels, RacerPixelsAndState
 from racer.settings.task import FrontCameraConfig, ObstacleConfig, RacerConfig, RacerPixelsConfig
-from racer.tracks.generator import make_random
 from racer.tracks.geometry import on_road, place_at
-from racer.tracks.naming import keep
-from shared_store.volume.layout import Store
-from tests.support.racer.racing import OVAL, counted, known, racer, straight
+from tests.support.racer.racing import OVAL, ahead, counted, known, racer, straight
 from tests.support.refusals import refusal
 from worker.learning.job import configure
 from worker.learning.report import figures_of, shown_of
@@ -26,13 +22,6 @@ from worker.tasks.run.policy_contract import policy_contract
 
 FIVE = [{"steering_angle": angle, "speed": 0.6} for angle in (30, 15, 0, -15, -30)]
 DISCRETE = {"action_space": FIVE, "action_space_type": "discrete", "sensor": ["FRONT_FACING_CAMERA"], "version": "5"}
-
-
-def ahead(task: Racer, speed: float = 0.0) -> torch.Tensor:
-    """Steer for the third waypoint."""
-    column = task.observation_names.index("waypoint_2_x")
-    x, y = task.observations[:, column], task.observations[:, column + 1]
-    return torch.stack((torch.atan2(y, x) / 0.5236, torch.full_like(x, speed)), 1)
 
 
 def test_a_car_that_steers_for_the_road_ahead_completes_a_lap() -> None:
@@ -271,22 +260,6 @@ def test_errors_that_only_a_rank_can_see_are_refused_in_one_line(tmp_path: Any) 
     (tmp_path / "model_metadata.json").write_text('{"action_space": [')
     with pytest.raises(ValueError, match="it is not JSON"):
         RacerConfig(action_space=str(tmp_path / "model_metadata.json")).actions()
-
-
-def test_a_track_of_the_store_is_found_by_the_ranks_of_a_job(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    hills = make_random(5, "hills")
-    keep(Store(tmp_path), hills, {"seed": 5})
-    with pytest.raises(ValueError, match=r"config.track: track 'hills': there is no such track"):
-        Racer.sketch(RacerConfig(track=("oval", "hills")))
-    monkeypatch.setenv("MUSTER_STORE", str(tmp_path))
-    circuit = Racer.sketch(RacerConfig(track=("oval", "hills"))).circuit
-    assert [track.digest for track in circuit.tracks] == [OVAL.digest, hills.digest]
-
-
-def test_a_metadata_file_is_equal_to_its_content_in_the_configuration(tmp_path: Any) -> None:
-    file = tmp_path / "model_metadata.json"
-    file.write_text(json.dumps(DISCRETE))
-    assert RacerConfig(action_space=str(file)).actions() == RacerConfig(action_space=DISCRETE).actions()
 
 
 def test_a_camera_sees_grass_asphalt_border_and_boxes_and_every_world_its_own() -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from racer.store.races import clock, key_of, race_changes, rules_of
+from racer.store.races import clock, race_changes, rules_of
 from racer.store.standings import BadRace, Contender, RaceResults, Ranking, differences, read_race, table
 from shared_store.volume.evaluations import lines
 from tests.support.racer.leagues import race
@@ -31,19 +31,6 @@ def test_the_rules_of_a_race_stand_above_its_config_and_every_lap_begins_at_the_
         **{"start_sideways": [0.0, 0.0], "start_turned": [0.0, 0.0], "alternate_direction": False},
     }
     assert "track" not in race_changes({})
-
-
-@pytest.mark.parametrize(
-    ("path", "key"),
-    [
-        (("episode_seconds",), "race.seconds"),
-        (("max_resets",), "race.max_resets"),
-        (("track", 1), "race.track.1"),
-        (("front", "width"), "race.config.front.width"),
-    ],
-)
-def test_an_error_is_reported_by_its_place_in_the_job(path: tuple[str | int, ...], key: str) -> None:
-    assert key_of({"track": ["oval"]}, path) == key
 
 
 def test_a_race_is_printed_as_a_table_of_its_trials() -> None:

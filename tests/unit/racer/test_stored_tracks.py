@@ -13,17 +13,6 @@ from racer.store.tracks import TrackError
 from shared_store.volume.layout import Store
 
 
-def test_a_track_is_kept_with_its_measures(store: Store) -> None:
-    assert tracks.names(store) == []
-    kept = tracks.add(store, "hills", b"rows", {"length": 40.0, "origin": {"seed": 7}})
-    assert (kept.name, kept.path, tracks.names(store)) == ("hills", store.path / "tracks" / "hills", ["hills"])
-    found = tracks.find(store, "hills")
-    facts = found.facts()
-    assert (facts["name"], facts["length"], facts["origin"]) == ("hills", 40.0, {"seed": 7}) and facts["created"] > 0
-    assert found.read() == b"rows"
-    assert all(file.stat().st_mode & 0o222 == 0 for file in kept.path.iterdir()), "nothing of it may be written"
-
-
 def test_a_track_is_never_changed(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     tracks.add(store, "hills", b"rows", {})
     for _ in range(2):
@@ -40,14 +29,6 @@ def test_a_name_that_can_be_no_directory_is_refused(store: Store, name: str) -> 
     with pytest.raises(TrackError, match="use letters, digits"):
         tracks.add(store, name, b"rows", {})
     assert not tracks.folder_in(store).exists()
-
-
-def test_an_unknown_track_is_reported_with_the_nearest_name(store: Store) -> None:
-    with pytest.raises(TrackError, match="track hils does not exist; none is kept yet"):
-        tracks.find(store, "hils")
-    tracks.add(store, "hills", b"rows", {})
-    with pytest.raises(TrackError, match=r"track hils does not exist; did you mean hills\?"):
-        tracks.find(store, "hils")
 
 
 def test_a_track_that_was_altered_is_not_read(store: Store) -> None:

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 import torch
-import warp
 
 from tests.conftest import REPOSITORY
 from tests.support.refusals import refusal
@@ -29,11 +26,8 @@ from worker.learning.algorithms import (
     installed,
     settings,
 )
-from worker.learning.distributed import Gang
 from worker.learning.job import Job
-from worker.learning.ppo import draws, heads
-from worker.learning.sac import kernels
-from worker.learning.setup import build_algorithm, load_kernels
+from worker.learning.setup import build_algorithm
 from worker.settings.errors import UserError
 
 HERE = "tests.unit.worker.test_algorithms"
@@ -63,7 +57,9 @@ def test_the_installed_algorithms_satisfy_the_protocol(name: str) -> None:
 
 def test_an_incomplete_algorithm_is_refused_with_its_missing_members() -> None:
     lacks = "begin, act, record, load_state_dict, world_state, load_world_state, build_policy"
-    with pytest.raises(UserError, match=rf"^train.algorithm: {HERE}:OnlyLearns is no algorithm: it lacks {lacks} \("):
+    with pytest.raises(
+        UserError, match=rf"^train.algorithm: {HERE}:OnlyLearns is not an algorithm: it lacks {lacks} \("
+    ):
         find_algorithm(f"{HERE}:OnlyLearns")
 
 
@@ -96,32 +92,8 @@ def test_a_mistake_of_a_user_s_algorithm_is_reported_in_one_line() -> None:
 
 def test_attributes_set_in_the_constructor_are_checked_before_the_first_iteration() -> None:
     chosen = find_algorithm(f"{HERE}:Forgetful")
-    with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is no algorithm: it lacks steps \("):
+    with pytest.raises(UserError, match=r"^train.algorithm: Forgetful is not an algorithm: it lacks steps \("):
         build_algorithm(chosen, None, Point(PointConfig(), 2), WorldShare(0, 2, 2), alone(), 0)
-
-
-class InTurn(Gang):
-    """Notes when it is this rank's turn to compile."""
-
-    def __init__(self) -> None:
-        vars(self).update(vars(alone()))
-        self.turn: str | None = None
-
-    @contextlib.contextmanager
-    def build_in_turn(self, warm: Any = None, what: str = "task") -> Iterator[None]:
-        self.turn = what
-        yield
-        self.turn = None
-
-
-@pytest.mark.parametrize(("name", "modules"), [("ppo", (draws, heads)), ("sac", (kernels,)), ("rsl_rl", ())])
-def test_kernels_are_compiled_by_one_rank_of_a_host_and_only_those_of_the_algorithm(
-    monkeypatch: pytest.MonkeyPatch, name: str, modules: tuple[Any, ...]
-) -> None:
-    gang, loaded = InTurn(), []
-    monkeypatch.setattr(warp, "load_module", lambda module, device: loaded.append((module, device, gang.turn)))
-    load_kernels(find_algorithm(name), gang)
-    assert loaded == [(module, "cpu", "algorithm") for module in modules]
 
 
 ENVIRONMENT = {"MUSTER_STORE": "/store", "MUSTER_RUN": "run"}
@@ -153,7 +125,7 @@ def test_an_invalid_section_of_the_spec_is_refused_too() -> None:
 
 
 @pytest.mark.parametrize("name", [":X", "my_module:", "", "pp", "a b:C", ".:C"])
-def test_a_name_of_no_algorithm_is_refused_with_those_that_there_are(name: str) -> None:
+def test_a_name_of_no_algorithm_is_refused_with_the_known_ones(name: str) -> None:
     assert refusal(find_algorithm, name, error=UserError) == (
         f"train.algorithm: no algorithm is called {name!r}; known: ppo, rsl_rl, sac, and module:Class of your own"
     )

@@ -128,7 +128,7 @@ def test_worlds_are_compared_by_global_index_whatever_shards_they_lie_in(
     assert all(torch.equal(tensor, content["worlds"]["state"][name][2:6]) for name, tensor in some.items())
 
 
-def test_files_that_can_not_be_compared_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_cannot_be_compared_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MUSTER_STORE", raising=False)
     with pytest.raises(UserError, match="run some: set MUSTER_STORE"):
         bitwise_diff.find_run("some")

@@ -77,7 +77,7 @@ FIRST, SECOND = "plug-in first: bundle_parts:", "plug-in second: bundle_parts:"
         ({"notes.json": {"a": object()}}, {}, "notes.json is not a JSON object"),
     ],
 )
-def test_what_is_no_document_of_its_own_is_refused_in_one_line(first: Any, second: Any, words: str) -> None:
+def test_anything_but_a_document_of_its_own_is_refused_in_one_line(first: Any, second: Any, words: str) -> None:
     PARTS["first:parts"] = first if callable(first) else lambda task: first
     PARTS["second:parts"] = lambda task: second
     with pytest.raises((UserError, PluginError), match=words) as refused:

@@ -93,7 +93,7 @@ SECTIONS: Mapping[str, dict[str, Any]] = {
 
 
 @pytest.mark.parametrize("message", SECTIONS)
-def test_a_section_that_can_not_be_is_refused_with_its_place(message: str) -> None:
+def test_a_section_that_cannot_be_is_refused_with_its_place(message: str) -> None:
     assert refused(**SECTIONS[message]).startswith(message)
 
 
@@ -248,7 +248,7 @@ def test_the_points_of_a_scan_are_the_declarations_alone() -> None:
         (lambda: Robot(MODEL, name="a/b"), "the name of a robot or object is a word without slashes, not 'a/b'"),
     ],
 )
-def test_robots_that_can_not_be_placed_or_called(make: Callable[[], Robot], message: str) -> None:
+def test_robots_that_cannot_be_placed_or_called(make: Callable[[], Robot], message: str) -> None:
     assert refusal(make) == message
 
 

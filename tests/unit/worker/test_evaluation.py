@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from shared_store.volume.layout import Run, Store
 from shared_store.volume.paired_episodes import are_paired, paired
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.worker.loop import alone
-from worker.evaluation.episodes import Episodes, Stopped, play
+from worker.evaluation.episodes import Episodes, play
 from worker.evaluation.evaluation import best_line, result_of, write_table
 from worker.evaluation.statistics import Sample, difference, share
 from worker.settings.cartpole import CartpoleConfig
@@ -88,18 +87,6 @@ def test_each_episode_has_its_return_length_terms_cause_and_success(task: Cartpo
     assert torch.allclose(terms, played.returns, atol=1e-5), "the weighted terms of a return make it"
 
 
-def test_an_episode_is_the_same_whatever_rounds_and_worlds_it_was_played_in(task: Cartpole) -> None:
-    def rounds() -> Iterator[Cartpole]:
-        for number in range(3):
-            task.restart(3, 6 * number)
-            yield task
-
-    batches = play(rounds(), Push(), GANG, episodes=16)
-    whole = play([Cartpole(task.config, 16, seed=3)], Push(), GANG)
-    assert len(batches.rows) == 16 and torch.equal(batches.rows, whole.rows)
-    assert len({tuple(row) for row in whole.rows.tolist()}) == 16, "and no two episodes are alike"
-
-
 class Judged(Cartpole):
     """A cart-pole that says what a success is."""
 
@@ -129,11 +116,6 @@ def test_a_success_is_a_metric_above_0_in_the_last_step_or_a_termination(task: C
         other.step(Push().act(other.groups))
         total += float(other.ended.sums[0, -1]) if other.dones[0] else 0.0
     assert float(moving.term("metric_speed")[0]) == pytest.approx(total / length, rel=1e-5)
-
-
-def test_a_stopped_evaluation_records_nothing() -> None:
-    with pytest.raises(Stopped):
-        play([Cartpole(config(), 2, seed=3)], Push(0.0), GANG, is_stop_requested=lambda: True)
 
 
 @pytest.fixture(scope="module")

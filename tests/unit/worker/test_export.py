@@ -157,7 +157,7 @@ def test_a_recurrent_policy_can_be_run_from_the_bundle_alone(tmp_path: Path, rec
 def test_a_bundle_that_does_worse_than_its_policy_is_not_published(
     tmp_path: Path, recurrent: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As where the episodes' ends are not told to the exported policy: all its actions alone were right."""
+    """As where the episodes' ends are not passed to the exported policy: all its actions alone were right."""
     run = Run(tmp_path / "run")
     before = exported(run, recurrent, GroupedPoint())
     stands = {path.name: path.read_bytes() for path in before.iterdir() if path.is_file()}
@@ -233,7 +233,7 @@ def test_the_metadata_has_what_ros_2_runners_read_with_all_digits() -> None:
         ({"critic_observations": "policy", "kernel_sizes": [9]}, r"settings: channels, kernel_sizes and strides: give"),
     ],
 )
-def test_settings_that_the_algorithm_does_not_take_any_more_are_told_in_one_line(
+def test_settings_that_the_algorithm_does_not_take_any_more_are_refused_in_one_line(
     settings: dict[str, Any], output: str
 ) -> None:
     """As after an upgrade: a checkpoint has the settings of the program that wrote it."""

@@ -130,7 +130,7 @@ def test_noise_is_in_the_unit_of_the_quantity_and_leaves_command_and_last_action
         ({"*_velocity": "much"}, ".*_velocity: expected a number of 0 or more, found 'much'"),
     ],
 )
-def test_noise_that_can_not_be_is_refused_in_one_line(noise: Any, message: str) -> None:
+def test_noise_that_cannot_be_is_refused_in_one_line(noise: Any, message: str) -> None:
     from worker.learning.job import user_errors
 
     kind = find_task("Quadruped")

@@ -1,4 +1,4 @@
-"""Worlds beyond memory: told before anything is built, with what they need and what fits."""
+"""Worlds beyond memory: reported before anything is built, with what they need and what fits."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_a_failed_allocation_is_reported_as_such(monkeypatch: pytest.MonkeyPatch
     error = FULL[0]
     existing = r"^worlds: 64 worlds of Point on rank 0 need more memory than there is; set fewer"
     with pytest.raises(UserError, match=existing), memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE):
-        raise error  # 64 worlds would fit: somebody else took it
+        raise error  # 64 worlds would fit: another process took it
     monkeypatch.setattr(memory_estimate, "free_bytes", lambda gang: 100_000)
     little = r"than the 0.0 GB that are free: about 0.0 GB. (About \d+ fit|Not even one fits): set "
     with pytest.raises(UserError, match=little), memory_estimate.within_memory(POINT, CONFIG, LEARNER, 64, HERE):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import signal
 import subprocess
@@ -15,9 +14,8 @@ from rsl_rl.models.mlp_model import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from tensordict import TensorDict
 
-from benchmarks import load, walking
-from benchmarks.peers import cases, conversion, table
-from benchmarks.peers.building import build_loop
+from benchmarks import load
+from benchmarks.peers import conversion, table
 from benchmarks.processor import contradictions
 from worker.tasks.declare.interface import Action, Interface, Observation
 
@@ -129,46 +127,12 @@ def test_a_policy_of_mjlab_fits_a_task_of_the_same_order_alone() -> None:
             conversion.check_contract(contract, own, "Own")
 
 
-def test_a_training_has_the_limits_of_its_case_and_the_rest_of_its_configuration(tmp_path: Path) -> None:
-    shared = cases.find_case("ant").shared("muster", "ours")
-    requested = {**shared, "worlds": 2, "iterations": 1, "save_every": 1, "seed": 0, "steps": 4, "hidden_sizes": [8]}
-    loop = build_loop(requested, tmp_path, config={"substeps": 1})
-    found = loop.task.solver_options
-    loop.close()
-    assert (found["iterations"], found["ls_iterations"]) == (3, 6)
-    assert loop.config.substeps == 1 and list(loop.training.settings.hidden_sizes) == [8]
-
-
-@pytest.mark.parametrize(
-    ("words", "output"),
-    [
-        ("muster --case g11", "there is no case 'g11'; did you mean g1?"),
-        ("muster --iterations 10", "--iterations 10: of these 10 are not counted"),
-        ("muster --algorithm td3", "--algorithm td3: there are ppo and sac"),
-        ("mjlab --case ant", "case ant: mjlab has no such task; its cases are go1, g1, go1-rough, g1-rough"),
-        ("mjlab --environment nowhere", "there is no environment with nowhere/bin/python"),
-        ("judge --out nowhere", "none of 0 records has checkpoints; train with --keep DIRECTORY"),
-        ("table --records nowhere", "there are no records in nowhere"),
-        ("environment mjlabs", "there is no environment 'mjlabs'; did you mean mjlab?"),
-        ("walking --task Ant", "--task Ant: it follows no velocity commands; there are Go1Flat, G1Flat"),
-    ],
-)
-def test_invalid_options_of_the_commands_are_refused(
-    words: str, output: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    name, *arguments = words.split()
-    command = walking if name == "walking" else importlib.import_module(f"benchmarks.peers.{name}")
-    with pytest.raises(SystemExit) as ended:
-        command.main(arguments)
-    assert ended.value.code == 2 and output in capsys.readouterr().err
-
-
 BUSY = "while :; do :; done"
 
 
 def test_a_machine_on_which_others_work_is_refused_or_marked(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(load, "WATCHED", 0.5)
-    started = f"timeout 60 sh -c '{BUSY}' >/dev/null & echo $!"  # its parent ends: it is no child of this process
+    started = f"timeout 60 sh -c '{BUSY}' >/dev/null & echo $!"  # its parent ends: it is not a child of this process
     other = int(subprocess.run(["sh", "-c", started], stdout=subprocess.PIPE, text=True, check=True).stdout)
     try:
         with pytest.raises(SystemExit, match=r"the machine is loaded: other processes used \d+ % .*--loaded-anyway"):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import dataclasses
-from types import SimpleNamespace
 
 import pytest
 import torch
@@ -13,15 +12,11 @@ from rsl_rl.models.mlp_model import MLPModel
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage.rollout_storage import RolloutStorage
 from tensordict import TensorDict
-from torch.distributions import Normal
 
 from tests.support.worker.loop import alone, iterate, transition_of
 from tests.support.worker.point_task import Point, PointConfig, PointPPO
 from worker.learning.algorithm import LearningSetting, Spaces, Transition, WorldShare
-from worker.learning.ppo import linear_layers as linear
 from worker.learning.ppo.fused import PPO
-from worker.learning.ppo.heads import Gaussian
-from worker.learning.ppo.networks import build_actor
 from worker.settings.ppo import PPOConfig
 
 
@@ -221,68 +216,6 @@ def test_every_epoch_has_its_own_minibatches_with_each_sample_once_and_as_many_o
         assert torch.equal(epoch.flatten().sort().values, torch.arange(32))
         for minibatch in epoch:
             assert (minibatch % 4).bincount().tolist() == [4, 4, 4, 4]
-
-
-@pytest.mark.parametrize("missing", [0, 5])
-def test_gradients_of_a_layer_are_those_of_torch(missing: int) -> None:
-    """Also where columns of zeros were added to its input; they are written over what was there."""
-    x, weight, bias = torch.randn(7, 3), torch.randn(4, 3), torch.randn(4)
-    leaves = [each.clone().requires_grad_() for each in (x, weight, bias)]
-    (torch.nn.functional.linear(*leaves).tanh() ** 2).sum().backward()
-    own = torch.nn.functional.pad(x, (0, missing)).requires_grad_(not missing)
-    parameters = [torch.nn.Parameter(each.clone()) for each in (weight, bias)]
-    for parameter in parameters:
-        parameter.grad = torch.full_like(parameter, 7.0)
-    (linear._Linear.apply(own, *parameters, torch.ones(7)).tanh() ** 2).sum().backward()
-    seen = [] if missing else [own.grad]
-    torch.testing.assert_close(
-        [*seen, *(each.grad for each in parameters)], [each.grad for each in leaves[-2 - len(seen) :]]
-    )
-
-
-@pytest.mark.parametrize("clip_values", [True, False])
-def test_the_loss_and_its_gradient_are_those_of_torch(clip_values: bool) -> None:
-    """Far from the old policy too, where ratios and values are clipped on either side."""
-    torch.manual_seed(3)
-    samples, actions, clip, weight = 500, 3, 0.2, 0.4
-    config = PPOConfig(clip=clip, clip_values=clip_values, value_loss_coef=0.7, entropy_coef=0.02)
-    drawn, old_mean, mean = (0.7 * torch.randn(samples, actions) for _ in range(3))
-    old_std, std = torch.tensor([0.9, 1.0, 1.2]), torch.tensor([1.0, 0.8, 1.3])
-    advantages, returns, old_values, values = (torch.randn(samples) for _ in range(4))
-    actor = build_actor(config, Spaces({"policy": (2,)}, actions))
-    actor.distribution.std_param.data.copy_(std)
-    head = Gaussian(actor, samples, weight, config)
-    head.std.copy_(old_std)
-    leaves = [mean.requires_grad_(), actor.distribution.std_param, values.unsqueeze(1).requires_grad_()]
-    order = torch.randperm(samples)
-
-    def rolled(each: torch.Tensor) -> torch.Tensor:
-        return each[order.argsort()].unsqueeze(1)
-
-    rollout = SimpleNamespace(actions=rolled(drawn), outputs=rolled(old_mean), advantages=rolled(advantages))
-    rollout.returns, rollout.values = rolled(returns), rolled(old_values)
-    old_log_prob = Normal(old_mean, old_std).log_prob(drawn).sum(1)
-    rollout.log_prob = head.log_prob(rollout)
-    torch.testing.assert_close(rollout.log_prob, rolled(old_log_prob))
-
-    policy, value = Normal(mean, leaves[1]), leaves[2][:, 0]
-    ratio = (policy.log_prob(drawn).sum(1) - old_log_prob).exp()
-    surrogate = torch.max(-advantages * ratio, -advantages * ratio.clamp(1 - clip, 1 + clip)).mean()
-    near = old_values + (value - old_values).clamp(-clip, clip) if clip_values else value
-    value_loss = torch.max((value - returns).square(), (near - returns).square()).mean()
-    entropy = policy.entropy().sum(1).mean()
-    kl = torch.distributions.kl_divergence(Normal(old_mean, old_std), policy).sum(1).mean()
-    loss = weight * (surrogate + 0.7 * value_loss - 0.02 * entropy)
-    expected = [*torch.autograd.grad(loss, leaves), weight * torch.stack((surrogate, value_loss, entropy, kl)).detach()]
-    assert (ratio < 1 - clip).any() and (ratio > 1 + clip).any()
-
-    losses = head.backward(order, rollout, mean, leaves[2])
-    torch.testing.assert_close([*(each.grad for each in leaves), losses], expected, rtol=1e-4, atol=1e-6)
-    assert int(head.clipped.sum()) == int(((ratio - 1).abs() > clip).sum())
-
-    mean.data[7, 0] = float("nan")
-    assert head.backward(order, rollout, mean, leaves[2])[[0, 3]].isnan().all()
-    assert mean.grad[7].isnan().all()
 
 
 def test_unsupported_settings_are_refused_by_name() -> None:

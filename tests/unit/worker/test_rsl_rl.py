@@ -143,10 +143,7 @@ NORMALISED = {**CNN, "obs_normalization": True, "distribution_cfg": GAUSSIAN}
         ({"obs_groups": {"actor": ["polcy"]}}, r"obs_groups: Observation 'polcy' in observation set 'actor' not found"),
         ({**CASES["shared convolutions"], "actor": NORMALISED}, r"actor\.obs_normalization: it sees images alone"),
         ({"critic": GRU, **mirrored()}, r"algorithm: Symmetry augmentation is not supported for recurrent"),
-        (
-            mirrored("tests.unit.worker.test_rsl_rl:turn"),
-            r".*data_augmentation_func: turn is called with env, obs and ",
-        ),
+        (mirrored("tests.unit.worker.test_rsl_rl:turn"), r".*data_augmentation_func: turn is called with env, obs"),
         ({**own(), **TAUGHT}, r"teacher_checkpoint: .*:OwnPPO has no teacher"),
         ({**own("Distillation", gradient_length=9), **TAUGHT}, SHORT),
         ({"torch_compile_mode": "reduce-overhead"}, r"algorithm: torch_compile_mode='reduce-overhead'"),
@@ -205,26 +202,6 @@ def test_loading_only_weights_leaves_the_optimizer_unchanged() -> None:
     assert not now["optimizer_state_dict"]["state"] and now["rnd_steps"] == 0 and fresh.learning_rate == 1e-3
     fresh.learning_rate = 2e-4
     assert fresh.algorithm.learning_rate == 2e-4 and fresh.learning_rate == 2e-4
-
-
-def test_counts_of_steps_come_to_the_host() -> None:
-    trained, task = made("nothing")
-    train(trained, task, 1)
-    state = copy.deepcopy(dict(trained.state_dict()))
-    fresh, _ = made("nothing")
-    for each in state["optimizer_state_dict"]["state"].values():
-        assert each["step"].device.type == "cpu"
-        each["step"] = Elsewhere(each["step"])
-    fresh.load_state_dict(state)
-    kept = fresh.algorithm.optimizer.state.values()
-    assert kept and all(type(each["step"]) is torch.Tensor for each in kept)
-
-
-class Elsewhere(torch.Tensor):
-    """Stands for a tensor on a GPU."""
-
-    def cpu(self) -> torch.Tensor:
-        return self.as_subclass(torch.Tensor).clone()
 
 
 def test_a_teacher_has_the_weights_of_a_run_of_ppo_and_must_fit_it() -> None:

@@ -9,13 +9,11 @@ from typing import Any
 
 import pytest
 import torch
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from tests.support.worker.loop import alone, groups, iterate, setting_of, transition_of
 from tests.support.worker.onnx import onnx_of
 from tests.support.worker.sac import SMALL, make, point, same
-from worker.learning.algorithm import Algorithm, LearningSetting, Policy, Spaces, WorldShare
-from worker.learning.cuda_graph import CudaGraphFunction
+from worker.learning.algorithm import LearningSetting, Spaces, WorldShare
 from worker.learning.distributed import Gang, RankPlacement
 from worker.learning.sac.sac import SAC, SAVED
 from worker.settings.sac import SACConfig
@@ -36,7 +34,7 @@ torch.set_num_threads(1)
         ({"v_min": 20.0}, "v_min: expected less than v_max"),
     ],
 )
-def test_settings_that_can_not_be_are_refused_by_name(settings: dict[str, Any], named: str) -> None:
+def test_settings_that_cannot_be_are_refused_by_name(settings: dict[str, Any], named: str) -> None:
     with pytest.raises(ValueError, match=named):
         SACConfig(**settings)
 
@@ -56,18 +54,6 @@ def test_an_unsupported_setting_is_refused(spaces: Spaces, settings: dict[str, A
     setting = LearningSetting(spaces, WorldShare(0, 2, 2), alone(), 0)
     with pytest.raises(ValueError, match=f"^sac.*{message}"):
         SAC(dataclasses.replace(SMALL, **settings), setting)
-
-
-def test_it_is_an_algorithm() -> None:
-    algorithm: Algorithm = make(point())
-    policy: Policy = algorithm.policy()
-    assert algorithm.captures_rollout and algorithm.steps == 4 and policy.act(groups(point())).shape == (6, 1)
-    names = {"actor_loss", "entropy", "critic_loss", "q_mean", "temperature", "learning_rate"}
-    names |= {"action_std", "gradient_norm", "v_max_mass"}
-    task = point()
-    for iteration in range(3):
-        metrics = iterate(algorithm, task, iteration, iteration + 1)
-        assert metrics.keys() == names and all(value.shape == () and value.isfinite() for value in metrics.values())
 
 
 @pytest.mark.parametrize("before", [1, 5, 9])
@@ -174,65 +160,6 @@ def test_the_exported_policy_computes_the_same() -> None:
     torch.testing.assert_close(torch.from_numpy(found), sac.policy().act(exported.sample), atol=1e-5, rtol=0)
     moved = exported.sample["policy"].mean(0) - sac.learner.actor.normalizer.mean
     assert (moved.abs() < 0.5).all(), "the sample is of what the policy has met"
-
-
-class Watch(TorchDispatchMode):
-    """Notes every operation that no graph can hold: those that ask the device for a value or draw from torch's generators."""
-
-    REFUSED = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "lift_fresh", "rand", "normal", "bernoulli")
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        name = func.overloadpacket.__name__
-        if any(part in name for part in self.REFUSED):
-            self.found.append(name)
-        return func(*args, **(kwargs or {}))
-
-
-@pytest.mark.parametrize("settings", [{"n_step": 3, "max_grad_norm": 1.0}, {"atoms": 1, "combine": "min"}])
-def test_recording_neither_reads_from_the_device_nor_draws_random_numbers(settings: dict[str, Any]) -> None:
-    task = point()
-    sac = make(task, **settings)
-    iterate(sac, task, 0, 3)
-    sac.begin(3)
-    task_step = transition_of(task)
-    with Watch() as watch:
-        for _ in range(sac.steps):
-            sac.act(task_step.observations)
-            sac.record(task_step)
-        for graph in sac.graphs:
-            graph()
-    assert watch.found == []
-
-
-MOMENTS = "gather moments, merge moments"
-
-
-@pytest.mark.parametrize(
-    ("settings", "ranks", "names"),
-    [
-        ({}, 1, "moments, updates"),
-        ({"normalize_observations": False}, 1, "updates"),
-        ({"policy_delay": 2}, 2, f"{MOMENTS}, critic gradients, critic step, all gradients, all steps"),
-        ({"policy_delay": 1}, 2, f"{MOMENTS}, all gradients, all steps"),
-        ({"normalize_observations": False, "policy_delay": 1}, 2, "all gradients, all steps"),
-    ],
-)
-def test_every_graph_is_called(
-    monkeypatch: pytest.MonkeyPatch, settings: dict[str, Any], ranks: int, names: str
-) -> None:
-    """The log names the graphs when all of them were captured; one that is never called would keep it waiting."""
-    called: list[str] = []
-    run = CudaGraphFunction.__call__
-    monkeypatch.setattr(CudaGraphFunction, "__call__", lambda graph: (called.append(graph.name), run(graph)))
-    task = point()
-    sac = make(task, gang=Half(0) if ranks > 1 else None, **settings)
-    assert ", ".join(graph.name for graph in sac.graphs) == names
-    iterate(sac, task, 0, 2)
-    assert set(called) == set(names.split(", "))
 
 
 class Half(Gang):

@@ -67,7 +67,7 @@ def test_a_mapping_changes_the_keys_that_it_names() -> None:
     assert config.camera.position == (0.0, -3.2, 1.4), "the task's own, not the camera's default"
 
 
-def test_rewards_and_curricula_can_not_be_changed_afterwards() -> None:
+def test_rewards_and_curricula_cannot_be_changed_afterwards() -> None:
     config = configure(Ant, {"config": {"curriculum": {"up": [[0, 1]]}}})
     assert config.curriculum == {"up": [[0, 1]]}
     for mapping in (config.rewards, config.curriculum, AntConfig().curriculum):

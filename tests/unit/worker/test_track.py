@@ -21,7 +21,6 @@ from tests.conftest import REPOSITORY
 from worker import track
 from worker.learning.job import Job
 from worker.telemetry.services import Service, TrainingEnd
-from worker.telemetry.tracking_processes import Tracking
 from worker.track import Sender, SenderLock
 
 TRAIN = {"task": "Cartpole", "ppo": {"learning_rate": 0.001}}
@@ -200,18 +199,12 @@ def job(run: Run, **requested: Any) -> Job:
     return Job({"train": TRAIN, "track": requested}, Store(run.path.parent.parent), run, 1, 1, "id", section=TRAIN)
 
 
-def test_another_rank_than_the_main_one_tracks_nothing(run: Run) -> None:
-    with Tracking(job(run, wandb={}), is_main=False) as tracking:
-        tracking.check()
-        assert tracking._services == []
-
-
 @pytest.mark.parametrize(
     ("arguments", "output"),
     [
         (["RUN"], "error: usage: python -m worker.track RUN_DIRECTORY wandb|mlflow"),
         (["RUN", "neptune"], "error: no service is called neptune; there are: wandb, mlflow"),
-        (["nowhere", "wandb"], "nowhere is no run that a `train` job made; name a directory of runs/ in the store"),
+        (["nowhere", "wandb"], "nowhere is not a run that a `train` job made; name a directory of runs/ in the store"),
     ],
 )
 def test_a_run_that_cannot_be_sent_afterwards_is_reported_in_one_line(

@@ -38,7 +38,7 @@ def test_a_childs_last_message_counts_and_a_cut_connection_is_a_death() -> None:
     children[0].report(3, "rank 3 exited with code 3")
     del children[0]
     assert received(main) == Loss("node 3: rank 3 exited with code 3", 3)
-    assert main.lost() is None, "told once"
+    assert main.lost() is None, "reported once"
 
 
 def test_a_cut_connection_is_a_death_and_that_of_a_stranger_is_not() -> None:
