@@ -100,6 +100,7 @@ lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/python -m docs.tools.plain_words
 
 format: $(READY)
 	$(BIN)/ruff check --fix .

@@ -197,8 +197,8 @@ class Rank:
                 message.pop("iteration", None)
             if message.get("done"):
                 self.received = None
-            if "message" in message:
-                reports.append(str(message.pop("message"))[:_LONGEST_VALUE])
+            for key in {"message", "said"} & message.keys():  # the second is its name in older versions
+                reports.append(str(message.pop(key))[:_LONGEST_VALUE])
             for name, value in message.items():
                 known = name in self.progress or (len(self.progress) < _MOST_VALUES and len(name) <= _LONGEST_VALUE)
                 if known and isinstance(value, str):
