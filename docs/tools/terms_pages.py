@@ -45,7 +45,7 @@ without a term here is refused with the row below that says what to use instead.
 parameters, which are ours under either name, and [ports.md](ports.md) compares a whole task of each with ours. `python -m docs.tools`
 writes this page from the functions' docstrings. Randomisation of physics, mjlab's `dr.*` and Isaac Lab's `randomize_*`, is not a
 term here but a `Randomize`: [their names](randomization.md#names-of-mjlab-and-isaac-lab). What else has no term here is at
-[the end](#names-that-are-no-terms-here). Three differences hold everywhere:
+[the end](#names-that-are-not-terms-here). Three differences hold everywhere:
 
 - Quaternions are xyzw here, and wxyz there.
 - A function for one joint, body or foot gives one number, and rewards are summed over them: mjlab's `joint_vel_l2` is
@@ -54,7 +54,7 @@ term here but a `Randomize`: [their names](randomization.md#names-of-mjlab-and-i
 """
 
 ELSEWHERE_HEAD = """\
-## Names that are no terms here
+## Names that are not terms here
 
 | their name | library | here |
 |---|---|---|

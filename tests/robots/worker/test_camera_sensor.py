@@ -68,7 +68,7 @@ def take(context: SensorContext, built: Camera, *, ages: tuple[int, int] = (1, 1
 
 
 def test_a_box_is_as_far_as_large_and_where_a_pinhole_puts_it(context: SensorContext) -> None:
-    turn(context, (2.0, 0.0), (2.0, 0.0))  # out of sight
+    turn(context, (2.0, 0.0), (2.0, 0.0))  # out of the camera's view
     at = {"position": (0.1, 0.0, 1.0)}
     depth = camera(context, **at, kind="depth", near=0.5, far=4.0)
     mask = camera(context, **at, kind="segmentation", of=("cube",)).images[0, 0] == 255

@@ -247,10 +247,10 @@ class Plain(SeeingConfig):
 @pytest.mark.parametrize(
     ("config", "camera", "sensors", "words"),
     [
-        (Plain(), Image("front"), FRONT, "observations.camera: it is an image, and Plain does not say so"),
-        (SEEING, Image("frnt"), FRONT, "there is no camera 'frnt'; did you mean front"),
-        (SEEING, Image("front"), {}, "there is no camera 'front'; the task declares none; give it a CameraSensor"),
-        (SEEING, Image("imu"), {"imu": Imu(body="cart"), **FRONT}, "the sensor imu is no camera; "),
+        (Plain(), Image("front"), FRONT, "observations.camera: it is an image, and Plain does not declare it"),
+        (SEEING, Image("frnt"), FRONT, "there is not a camera 'frnt'; did you mean front"),
+        (SEEING, Image("front"), {}, "there is not a camera 'front'; the task declares none; give it a CameraSensor"),
+        (SEEING, Image("imu"), {"imu": Imu(body="cart"), **FRONT}, "the sensor imu is not a camera; "),
         (SEEING, Image("front"), {"front": CameraSensor(body="cat")}, "sensors.front: no body of robot matches 'cat'"),
         (SEEING, NUMBERS, {}, "SeeingConfig.further_groups says that it is an image, and the task gives terms"),
         (SEEING, None, {}, "SeeingConfig.further_groups has camera, and the task declares no such group"),
