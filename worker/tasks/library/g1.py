@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from worker.settings.velocity import G1FlatConfig, G1RoughConfig, VelocityConfig
 from worker.simulation.declared_randomization import Randomize
 from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.height_scan import RingPattern
 from worker.tasks import terms
-from worker.tasks.declare.declaration import Reward
 from worker.tasks.library.robots.g1 import ACTION_SCALE, FEET, g1
 from worker.tasks.library.velocity import Velocity, Walker, rate
 
@@ -87,16 +85,12 @@ class G1Flat(Velocity):
         "nconmax": 64,
         "njmax": 230,
     }
-
-    def sensors_of(self, config: VelocityConfig) -> Mapping[str, Any]:
-        """Also the robot's contacts with itself."""
-        touching = ContactSensor(bodies="*", against="robot", fine=True, together=True)
-        return {**super().sensors_of(config), "self_contacts": touching}
-
-    def rewards_of(self, config: VelocityConfig) -> Mapping[str, Reward]:
-        """Also a cost of contacts with itself."""
-        collisions = rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0)
-        return {**super().rewards_of(config), "self_collisions": collisions}
+    changes = (  # contacts with itself
+        {
+            "sensors": {"self_contacts": ContactSensor(bodies="*", against="robot", fine=True, together=True)},
+            "rewards": {"self_collisions": rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0)},
+        },
+    )
 
 
 class G1Rough(G1Flat):
