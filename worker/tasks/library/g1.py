@@ -10,6 +10,7 @@ from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.height_scan import RingPattern
 from worker.tasks import terms
 from worker.tasks.library.robots.g1 import ACTION_SCALE, FEET, g1
+from worker.tasks.library.robots.mjlab import walking
 from worker.tasks.library.velocity import Velocity, Walker, rate
 
 G1 = Walker(
@@ -58,13 +59,7 @@ G1 = Walker(
     ),
     randomize={
         "foot_friction": Randomize("friction", geoms=FEET, range=(0.3, 1.2), operation="set", shared=True),
-        "encoder_bias": Randomize("encoder_bias", joints="*", range=(-0.015, 0.015), operation="add"),
-        "base_com": Randomize(
-            "center_of_mass",
-            bodies="torso_link",
-            range={"x": (-0.025, 0.025), "y": (-0.025, 0.025), "z": (-0.03, 0.03)},
-            operation="add",
-        ),
+        **walking("torso_link"),
     },
 )
 

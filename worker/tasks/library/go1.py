@@ -6,12 +6,12 @@ import math
 from typing import Any, ClassVar
 
 from worker.settings.velocity import Go1FlatConfig, Go1RoughConfig, VelocityConfig
-from worker.simulation.declared_randomization import Randomize
 from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.height_scan import RingPattern
 from worker.tasks import terms
 from worker.tasks.declare.declaration import Termination
 from worker.tasks.library.robots.go1 import ACTION_SCALE, FEET, go1
+from worker.tasks.library.robots.mjlab import friction, walking
 from worker.tasks.library.velocity import Velocity, Walker, rate
 
 GO1 = Walker(
@@ -24,36 +24,7 @@ GO1 = Walker(
     touching=ContactSensor(geoms=FEET, fine=True),
     ring=RingPattern(radius=0.04, count=4, center=True),
     tolerances=terms.Tolerances(standing={"*_calf_joint": 0.1, "*": 0.05}, walking={"*_calf_joint": 0.6, "*": 0.3}),
-    randomize={
-        "foot_friction_slide": Randomize(
-            "friction", geoms=FEET, axes=("slide",), range=(0.3, 1.5), operation="set", shared=True
-        ),
-        "foot_friction_spin": Randomize(
-            "friction",
-            geoms=FEET,
-            axes=("torsion",),
-            range=(1e-4, 2e-2),
-            operation="set",
-            distribution="log_uniform",
-            shared=True,
-        ),
-        "foot_friction_roll": Randomize(
-            "friction",
-            geoms=FEET,
-            axes=("roll",),
-            range=(1e-5, 5e-3),
-            operation="set",
-            distribution="log_uniform",
-            shared=True,
-        ),
-        "encoder_bias": Randomize("encoder_bias", joints="*", range=(-0.015, 0.015), operation="add"),
-        "base_com": Randomize(
-            "center_of_mass",
-            bodies="trunk",
-            range={"x": (-0.025, 0.025), "y": (-0.025, 0.025), "z": (-0.03, 0.03)},
-            operation="add",
-        ),
-    },
+    randomize={**friction("foot_friction", FEET, shared=True), **walking("trunk")},
 )
 
 
