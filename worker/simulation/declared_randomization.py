@@ -252,5 +252,5 @@ class Randomize:
             raise ValueError(f"{self._where}: seconds {instead}")
         if self.seconds is not None and not 0 < self.seconds[0] <= self.seconds[1] < math.inf:
             raise ValueError(
-                f"{self._where}: seconds={self.seconds} is no interval; give two times above 0, the lesser first"
+                f"{self._where}: seconds={self.seconds} is not an interval; give two times above 0, the lesser first"
             )

@@ -134,7 +134,7 @@ def _ends(joint: ElementTree.Element, shown: str, links: list[str]) -> tuple[str
 
 
 def _check_tree(root: ElementTree.Element, joints: list[ElementTree.Element], shown: str) -> None:
-    """Refuse what is no tree of links, and joints that float below a link."""
+    """Refuse what is not a tree of links, and joints that float below a link."""
     links = [link.get("name", "") for link in root.findall("link")]
     if not links:
         raise ValueError(f"{shown} has no link; a robot needs one at least")

@@ -32,7 +32,7 @@ NUMBERS = {
 
 
 def faults(both: UsdStage) -> Iterator[str]:
-    """Joints that are missing, that make no tree, or whose limits are no range."""
+    """Joints that are missing, that make no tree, or whose limits are not a range."""
     builder = both.builder
     moved = {builder.body_label[child] for child in builder.joint_child}
     pairs: dict[tuple[str, ...], str] = {}
@@ -59,7 +59,7 @@ def faults(both: UsdStage) -> Iterator[str]:
         elif index is None and not prim.IsA(UsdPhysics.FixedJoint):  # one to the world is the root of a fixed robot
             yield f"joint {path} is missing"
         elif None not in limits and not limits[0] <= limits[1]:
-            yield f"joint {path}: its limits {limits[0]:g} and {limits[1]:g} are no range"
+            yield f"joint {path}: its limits {limits[0]:g} and {limits[1]:g} are not a range"
         elif index is not None:
             child, count = builder.body_label[builder.joint_child[index]], sum(builder.joint_dof_dim[index])
             if ends and child not in ends:

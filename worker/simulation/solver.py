@@ -185,7 +185,7 @@ class Solver(SolverMuJoCo):
         """Newton checks whether masks alone exclude all filtered pairs, and replaces the masks if they don't.
 
         In MuJoCo shapes fixed to the world never collide with the world, whatever their masks, so such pairs (the base of an arm and the
-        ground) are no reason to replace masks.
+        ground) are not a reason to replace masks.
         """
         of_shapes = {int(body) for body in model.shape_body.numpy()[selected_shapes]}
         fixed = sorted(of_shapes & _fixed_bodies(model))

@@ -53,7 +53,7 @@ class Terrain:
         seed: Seed of all randomness in the patches.
 
     Raises:
-        ValueError: The patches can't be built: no kinds, a share that is not positive, a size that is no multiple of the
+        ValueError: The patches can't be built: no kinds, a share that is not positive, a size that is not a multiple of the
             resolution or has under 2 x 2 cells, fewer columns than kinds, or what :meth:`Patch.check` refuses.
     """
 

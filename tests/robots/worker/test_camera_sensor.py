@@ -68,7 +68,7 @@ def take(context: SensorContext, built: Camera, *, ages: tuple[int, int] = (1, 1
 
 
 def test_a_box_is_as_far_as_large_and_where_a_pinhole_puts_it(context: SensorContext) -> None:
-    turn(context, (2.0, 0.0), (2.0, 0.0))  # out of sight
+    turn(context, (2.0, 0.0), (2.0, 0.0))  # out of the camera's view
     at = {"position": (0.1, 0.0, 1.0)}
     depth = camera(context, **at, kind="depth", near=0.5, far=4.0)
     mask = camera(context, **at, kind="segmentation", of=("cube",)).images[0, 0] == 255
@@ -215,24 +215,24 @@ def test_each_episode_may_draw_a_new_mount(context: SensorContext) -> None:
     assert set(drawn.state_tensors()) == {"images", "mounts"}
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        ({"body": "amr"}, "no body of robot matches 'amr'; did you mean arm?"),
-        ({"body": "arm", "robot": "robt"}, "CameraSensor.robot: there is no robot 'robt'; did you mean robot?"),
-        ({"site": "*e", "body": "arm"}, "CameraSensor: give either body or site, and not both"),
-        ({"kind": "gray"}, "CameraSensor.kind: there is no kind 'gray'; did you mean grey?"),
-        ({"width": 0}, "CameraSensor.width: expected an integer from 1 to 1024, found 0"),
-        ({"fov": 180.0}, "CameraSensor.fov: expected an angle between 0 and pi [rad], found 180.0"),
-        ({"kind": "depth", "near": 2.0, "far": 1.0}, "CameraSensor.near and far: expected 0 <= near < far"),
-        ({"kind": "depth", "samples": 4}, "CameraSensor.samples: depth takes one ray per pixel"),
-        ({"kind": "segmentation", "of": ("cub",)}, "of: there is no robot or object 'cub'; did you mean cube?"),
-        ({"of": ("cube",)}, "CameraSensor.of: only a segmentation takes it, and kind is color"),
-        ({"target": (0.0, 0.0, 0.0)}, "CameraSensor.target: the camera stands there, at [0.0, 0.0, 0.0]"),
-        ({"target": (1.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0)}, "give either target or rotation"),
-        ({"rotation": (0.0, 0.0, 0.0, 0.0)}, "CameraSensor.rotation: expected a quaternion xyzw"),
-        ({"angle_range": -0.1}, "CameraSensor.angle_range: expected 0 or more, found -0.1"),
-    ],
-)
-def test_a_camera_that_cannot_be_is_refused_in_one_line(context: SensorContext, options: dict, words: str) -> None:
-    assert words in refusal(lambda: CameraSensor(**options).build(context))
+REFUSED: dict[str, dict[str, Any]] = {
+    "no body of robot matches 'amr'; did you mean arm?": {"body": "amr"},
+    "CameraSensor.robot: there is no robot 'robt'; did you mean robot?": {"body": "arm", "robot": "robt"},
+    "CameraSensor: give either body or site, and not both": {"site": "*e", "body": "arm"},
+    "CameraSensor.kind: there is no kind 'gray'; did you mean grey?": {"kind": "gray"},
+    "CameraSensor.width: expected an integer from 1 to 1024, found 0": {"width": 0},
+    "CameraSensor.fov: expected an angle between 0 and pi [rad], found 180.0": {"fov": 180.0},
+    "CameraSensor.near and far: expected 0 <= near < far": {"kind": "depth", "near": 2.0, "far": 1.0},
+    "CameraSensor.samples: depth takes one ray per pixel": {"kind": "depth", "samples": 4},
+    "of: there is no robot or object 'cub'; did you mean cube?": {"kind": "segmentation", "of": ("cub",)},
+    "CameraSensor.of: only a segmentation takes it, and kind is color": {"of": ("cube",)},
+    "CameraSensor.target: the camera stands there, at [0.0, 0.0, 0.0]": {"target": (0.0, 0.0, 0.0)},
+    "give either target or rotation": {"target": (1.0, 0.0, 0.0), "rotation": (0.0, 0.0, 0.0, 1.0)},
+    "CameraSensor.rotation: expected a quaternion xyzw": {"rotation": (0.0, 0.0, 0.0, 0.0)},
+    "CameraSensor.angle_range: expected 0 or more, found -0.1": {"angle_range": -0.1},
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_an_invalid_camera_is_refused_in_one_line(context: SensorContext, words: str) -> None:
+    assert words in refusal(lambda: CameraSensor(**REFUSED[words]).build(context))

@@ -1,4 +1,4 @@
-"""Differential inverse kinematics against MuJoCo's own Jacobians and numpy, and arms that go where actions say."""
+"""Inverse kinematics, by displacements and to absolute poses, against MuJoCo's own Jacobians and numpy."""
 
 from __future__ import annotations
 
@@ -274,25 +274,6 @@ def refused(**changed: Any) -> str:
     return refusal(type("Wrong", (Planar,), changed).sketch, ArmConfig())
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"body": "lower"}, "DifferentialIK: give either body or site, and not both"),
-        ({"site": "tipp"}, "no site of robot matches 'tipp'; did you mean tip?"),
-        ({"axes": ("x", "rol")}, "DifferentialIK.axes: there is no axis 'rol'; did you mean roll?"),
-        ({"axes": ("x", "x")}, "DifferentialIK.axes is ('x', 'x'); give some of x, y, z, roll, pitch, yaw, each once"),
-        ({"damping": 0.0}, "DifferentialIK.damping is 0.0; use a finite number > 0"),
-        ({"posture_weight": -1.0}, "DifferentialIK.posture_weight is -1.0; use a finite number >= 0"),
-        ({"soft_factor": 1.5}, "DifferentialIK.soft_factor is 1.5; use a number > 0, at most 1"),
-        ({"joints": "elbo"}, "no joint of robot matches 'elbo'; did you mean elbow?"),
-        ({"joints": "*"}, "DifferentialIK.joints: grip does not move tip; those that do: shoulder, elbow"),
-    ],
-)
-def test_what_can_t_be_is_refused_in_one_line(options: dict[str, Any], message: str) -> None:
-    output = refused(ik=replace(Planar.ik, **options))
-    assert output.startswith(f"task Wrong: sensors.tip: {message}")
-
-
 def test_actions_that_do_not_fit_are_refused_in_one_line() -> None:
     move, grip = Planar.actions["tip"], Planar.actions["grip"]
     unasked = "task Wrong: sensors.tip: no action asks for it; declare one, such as Action(terms.move_frame)"
@@ -301,16 +282,141 @@ def test_actions_that_do_not_fit_are_refused_in_one_line() -> None:
     both = replace(Planar.ik, site=None, body="finger", joints="*")
     driven = {"tip": Action(terms.move_frame, kind="position"), "grip": grip}
     assert "sensors.tip: joint grip is driven by two terms; each joint has one" in refused(ik=both, actions=driven)
-    for options, output in (
-        ({"size": 3}, "actions.tip: size is 3, more than the 2 columns of tip"),
-        ({"offset": "default"}, 'offset="default" is for terms of joints'),
+    for ik, options, output in (
+        (Planar.ik, {"size": 3}, "actions.tip: size is 3, more than the 2 columns of tip"),
+        (Planar.ik, {"offset": "default"}, 'offset="default" is for terms of joints'),
+        (Point.ik, {"size": 1}, "actions.tip: size is 1, and an absolute target has 2 columns; leave size= out"),
     ):
-        assert output in refused(actions={"tip": Action(terms.move_frame, **options)})
+        assert output in refused(ik=ik, actions={"tip": Action(terms.move_frame, **options), "grip": grip})
     two = PLANAR.replace('<joint name="elbow"', '<joint name="twist" axis="1 0 0"/><joint name="elbow"')
     assert "elbow is one of several joints between the same two bodies" in refused(text=two)
-
-
-def test_a_joint_without_an_actuator_is_refused_in_one_line() -> None:
     idle = Robot(PLANAR, actuators=(replace(SERVO, joints=("shoulder", "grip")),))
     output = refused(robot=lambda self, config: idle)
     assert "sensors.tip: joint elbow has no actuator; give the robot one" in output
+
+
+FULL = ("x", "y", "z", "qx", "qy", "qz", "qw")
+GOALS = ((0.2, -0.7, 0.9, 0.05, -0.5, 0.2, 0.8), (-1.0, 0.8, 0.0, -0.1, 0.2, -0.4, 0.3))
+"""Positions of the joints whose palm poses are the goals: near those of ``ARM_POSITIONS``."""
+
+
+class Point(Planar):
+    """The tip of two links goes to a place in the plane; an action of 1 is 1 m."""
+
+    ik = DifferentialIK(site="tip", joints=("shoulder", "elbow"), axes=("x", "y"), absolute=True)
+    actions: Mapping[str, Action] = {
+        "tip": Action(terms.move_frame, kind="position"),
+        "grip": Action(terms.position_target, joints="grip", kind="position"),
+    }
+
+
+class Posed(Skew):
+    """The palm goes to a pose."""
+
+    ik = DifferentialIK(site="palm", axes=FULL, absolute=True)
+
+
+def palm(positions: Any, frame: str = "root") -> tuple[np.ndarray, np.ndarray]:
+    """MuJoCo's position [m] and rotation matrix of the palm, seen from the base or from the world."""
+    reference = Reference(ARM)
+    data = reference.data
+    data.qpos[:] = positions
+    mujoco.mj_forward(reference.model, data)
+    place, turn = data.site("palm").xpos.copy(), data.site("palm").xmat.reshape(3, 3).copy()
+    if frame == "world":
+        return place, turn
+    base = data.body("base")
+    base_turn = base.xmat.reshape(3, 3)
+    return base_turn.T @ (place - base.xpos), base_turn.T @ turn
+
+
+def base_rotation() -> np.ndarray:
+    """The rotation matrix of the base of the seven-jointed arm."""
+    reference = Reference(ARM)
+    mujoco.mj_forward(reference.model, reference.data)
+    return np.array(reference.data.body("base").xmat.reshape(3, 3))
+
+
+def xyzw(turn: np.ndarray) -> np.ndarray:
+    found = np.zeros(4)
+    mujoco.mju_mat2Quat(found, turn.flatten())
+    return found[[1, 2, 3, 0]]
+
+
+def rotation_vector(turn: np.ndarray) -> np.ndarray:
+    """Of a rotation matrix [rad], by its trace and its antisymmetric part."""
+    angle = math.acos((np.trace(turn) - 1.0) / 2.0)
+    parts = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    return parts * angle / (2.0 * math.sin(angle))
+
+
+@pytest.mark.parametrize("frame", ["root", "world"])
+def test_steps_to_a_pose_are_those_of_mujoco_s_jacobian_and_of_what_is_left_to_it(frame: str) -> None:
+    task = made(Posed, frame=frame, position_weight=2.0, orientation_weight=0.5, max_step=5.0)
+    aims = [palm(positions, frame) for positions in GOALS]
+    lengths = (3.0, -0.5)  # of quaternions that need not have the length 1, and whose negative is the same rotation
+    targets = [[*place, *(length * xyzw(turn))] for (place, turn), length in zip(aims, lengths, strict=True)]
+    found = requested(task, ARM_POSITIONS, targets)
+    for world, positions in enumerate(ARM_POSITIONS):
+        place, turn = palm(positions, frame)
+        left = np.concatenate((aims[world][0] - place, rotation_vector(aims[world][1] @ turn.T)))
+        assert np.abs(left).min() > 1e-3
+        moves = jacobian(ARM, positions, site="palm")
+        if frame == "world":
+            moves = np.kron(np.eye(2), base_rotation()) @ moves
+        expected = damped(moves, left, [2.0] * 3 + [0.5] * 3)
+        np.testing.assert_allclose(found[world], within(positions, expected), atol=2e-4)
+
+
+def test_a_movement_along_the_world_s_axes_is_turned_from_one_along_the_root_s() -> None:
+    task = made(Skew, axes=POSE, frame="world", max_step=5.0)
+    targets = np.array([[0.03, -0.02, 0.01, 0.05, -0.1, 0.02], [-0.01, 0.02, 0.05, -0.08, 0.0, 0.1]])
+    found = requested(task, ARM_POSITIONS, targets)
+    base = np.kron(np.eye(2), base_rotation())
+    for world, positions in enumerate(ARM_POSITIONS):
+        expected = damped(base @ jacobian(ARM, positions, site="palm"), targets[world])
+        np.testing.assert_allclose(found[world], within(positions, expected), atol=1e-4)
+
+
+def test_without_a_quaternion_the_orientation_stays_as_it_is() -> None:
+    task = made(Posed, max_step=5.0)
+    place, turn = palm(ARM_POSITIONS[0])
+    still = [[*place, 0.0, 0.0, 0.0, 0.0], [*palm(ARM_POSITIONS[1])[0], *xyzw(palm(ARM_POSITIONS[1])[1])]]
+    assert abs(rotation_vector(turn)).max() > 0.1  # so that an identity would have turned it
+    np.testing.assert_allclose(requested(task, ARM_POSITIONS, still), 0.0, atol=2e-5)
+
+
+def test_the_contract_names_numbers_of_a_pose_and_their_units() -> None:
+    task = made(Posed, frame="world")
+    actions = policy_contract(task, "Posed").actions
+    assert [action.name for action in actions] == [f"palm_{axis}" for axis in FULL]
+    assert [action.unit for action in actions] == ["m"] * 3 + ["1"] * 4
+    assert "one number of its wanted pose" in actions[0].rule
+    assert "bring the site palm in the world's frame to x, y, z, qx, qy, qz, qw" in actions[0].rule
+
+
+MOVED, ABSOLUTE = Planar.ik, Point.ik
+REFUSED: Mapping[str, tuple[DifferentialIK, dict[str, Any]]] = {
+    "DifferentialIK: give either body or site, and not both": (MOVED, {"body": "lower"}),
+    "no site of robot matches 'tipp'; did you mean tip?": (MOVED, {"site": "tipp"}),
+    "DifferentialIK.axes: there is no axis 'rol'; did you mean roll?": (MOVED, {"axes": ("x", "rol")}),
+    "DifferentialIK.axes is ('x', 'x'); give some of x, y, z, roll, pitch, yaw, each": (MOVED, {"axes": ("x", "x")}),
+    "DifferentialIK.damping is 0.0; use a finite number > 0": (MOVED, {"damping": 0.0}),
+    "DifferentialIK.posture_weight is -1.0; use a finite number >= 0": (MOVED, {"posture_weight": -1.0}),
+    "DifferentialIK.soft_factor is 1.5; use a number > 0, at most 1": (MOVED, {"soft_factor": 1.5}),
+    "DifferentialIK.joints: grip does not move tip; those that do: shoulder, elbow": (MOVED, {"joints": "*"}),
+    "DifferentialIK.axes: there is no axis 'qw'": (MOVED, {"axes": ("x", "qw")}),
+    "DifferentialIK.axes: there is no axis 'roll'; there are x, y, z, qx": (ABSOLUTE, {"axes": ("x", "roll")}),
+    "DifferentialIK.axes has qx, qw; an orientation is qx, qy, qz, qw, in": (ABSOLUTE, {"axes": ("x", "qx", "qw")}),
+    "DifferentialIK.frame is 'wrld'; did you mean world?": (ABSOLUTE, {"frame": "wrld"}),
+    "DifferentialIK.from_targets adds up movements; leave it out where absolute=True": (
+        ABSOLUTE,
+        {"from_targets": True},
+    ),
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_invalid_options_are_refused_in_one_line(message: str) -> None:
+    ik, options = REFUSED[message]
+    assert refused(ik=replace(ik, **options)).startswith(f"task Wrong: sensors.tip: {message}")

@@ -35,7 +35,7 @@ from worker.simulation.sensors.camera import CameraSensor
 from worker.simulation.sensors.imu import Imu
 from worker.tasks.__main__ import describe
 from worker.tasks.compile.tables import tables
-from worker.tasks.declare.declaration import Declaration, Image, Observation
+from worker.tasks.declare.declaration import Declaration, Image
 from worker.tasks.run.gym import TaskVectorEnv
 from worker.tasks.run.policy_contract import images_of
 
@@ -216,11 +216,6 @@ def test_scenes_differ_as_the_configuration_asks() -> None:
         images = Seeing(config, 3, seed=3).groups["camera"].clone()
         assert not torch.equal(images[0], images[1]), scene
         assert torch.equal(images[2:], Seeing(config, 1, seed=3, first_world=2).groups["camera"]), "not the rank's"
-    moved = Seeing(SeeingConfig(spread=0.0, randomize=Randomization(camera_position=0.05, camera_angle=0.1)), 2, seed=3)
-    poses = moved.sensors["front"].arrays.poses.numpy()
-    shifts = poses[:, :3] - [0.15, 0.0, 1.0]
-    assert (np.abs(shifts) <= 0.05).all() and not np.allclose(shifts[0], shifts[1])
-    assert not np.allclose(poses[0, 3:], poses[1, 3:], atol=1e-3), "turned otherwise"
     noisy = SeeingConfig(randomize=Randomization(observation_noise=0.1))
     assert Seeing.sketch(noisy).plan.groups["critic"], "numbers beside images may be noisy"
 
@@ -244,21 +239,19 @@ class Plain(SeeingConfig):
     further_groups: ClassVar[Mapping[str, bool]] = MappingProxyType({})
 
 
-@pytest.mark.parametrize(
-    ("config", "camera", "sensors", "words"),
-    [
-        (Plain(), Image("front"), FRONT, "observations.camera: it is an image, and Plain does not say so"),
-        (SEEING, Image("frnt"), FRONT, "there is no camera 'frnt'; did you mean front"),
-        (SEEING, Image("front"), {}, "there is no camera 'front'; the task declares none; give it a CameraSensor"),
-        (SEEING, Image("imu"), {"imu": Imu(body="cart"), **FRONT}, "the sensor imu is no camera; "),
-        (SEEING, Image("front"), {"front": CameraSensor(body="cat")}, "sensors.front: no body of robot matches 'cat'"),
-        (SEEING, NUMBERS, {}, "SeeingConfig.further_groups says that it is an image, and the task gives terms"),
-        (SEEING, None, {}, "SeeingConfig.further_groups has camera, and the task declares no such group"),
-    ],
-)
-def test_a_group_of_images_that_does_not_fit_is_refused_in_one_line(
-    config: SeeingConfig, camera: Any, sensors: dict, words: str
-) -> None:
+REFUSED: Mapping[str, tuple[SeeingConfig, Any, dict[str, Any]]] = {
+    "observations.camera: it is an image, and Plain does not declare it": (Plain(), Image("front"), FRONT),
+    "there is no camera 'frnt'; did you mean front": (SEEING, Image("frnt"), FRONT),
+    "there is no camera 'front'; the task declares none; give it a CameraSensor": (SEEING, Image("front"), {}),
+    "the sensor imu is not a camera; ": (SEEING, Image("imu"), {"imu": Imu(body="cart"), **FRONT}),
+    "SeeingConfig.further_groups says that it is an image, and the task gives terms": (SEEING, NUMBERS, {}),
+    "SeeingConfig.further_groups has camera, and the task declares no such group": (SEEING, None, {}),
+}
+
+
+@pytest.mark.parametrize("words", REFUSED)
+def test_a_group_of_images_that_does_not_fit_is_refused_in_one_line(words: str) -> None:
+    config, camera, sensors = REFUSED[words]
     groups = {"policy": NUMBERS} | ({"camera": camera} if camera is not None else {})
     assert words in refusal(declared, config, groups, sensors)
 
@@ -269,4 +262,3 @@ def test_images_need_numbers_beside_them() -> None:
         ({**NUMBERS, "front": Image("front")}, "observations.front: an Image is a group of its own"),
     ):
         assert words in refusal(declared, SeeingConfig(), observations, FRONT)
-    assert all(isinstance(term, Observation) for term in NUMBERS.values())

@@ -13,7 +13,7 @@ import torch
 from tests.support.refusals import refusal
 from tests.support.worker.lift_reference import GAINS, HOME, TIPS, reference, stiffness, to_mujoco, touching_pairs
 from tests.support.worker.robots import needs_mjlab
-from tests.support.worker.tasks import observe, played_twice, plays_like_its_part, put, same, statistics
+from tests.support.worker.tasks import observe, put, statistics
 from worker.learning.job import configure
 from worker.settings.errors import UserError
 from worker.settings.lift import LiftCubeConfig
@@ -270,16 +270,6 @@ def test_fingertips_differ_from_world_to_world(lift: LiftCube) -> None:
         if axis:  # uniform in the logarithm: half of them lie below the geometric mean
             drawn, least, greatest = np.log(drawn), math.log(least), math.log(greatest)
         assert 0.3 < np.mean(drawn < 0.5 * (least + greatest)) < 0.7 and np.ptp(drawn) > 0.7 * (greatest - least)
-
-
-def test_it_goes_on_bit_for_bit_and_worlds_do_not_know_their_rank(lift: LiftCube) -> None:
-    task = LiftCube(LiftCubeConfig(episode_seconds=0.3, command_seconds=(0.1, 0.15)), 3, seed=5)
-    first, again = played_twice(task)
-    assert torch.cat([step[2] for step in first]).any(), "an episode ended"
-    assert same(first, again)
-
-    part = LiftCube(LiftCubeConfig(), 2, seed=1, first_world=2)
-    assert plays_like_its_part(lift, part)
 
 
 @pytest.mark.parametrize(

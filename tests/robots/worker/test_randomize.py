@@ -333,7 +333,7 @@ def test_inverse_weights_follow_the_masses_as_in_mujoco(kind: str) -> None:
         ("mass", {"bodies": "*", "at": (0.0, 0.0, 1.0)}, "only a payload has a place"),
     ],
 )
-def test_a_declaration_that_can_not_be_is_refused(what: str, options: dict[str, Any], message: str) -> None:
+def test_an_invalid_declaration_is_refused(what: str, options: dict[str, Any], message: str) -> None:
     assert message in refusal(Randomize, what, **{"range": (0.5, 1.0), **options})
 
 

@@ -96,23 +96,20 @@ def test_a_half_circle_of_rays_by_hand() -> None:
     assert directions == pytest.approx(np.array([[half, -half, 0], [half, half, 0], [0, 0, 1], [0, 0, 1]]), abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("options", "output"),
-    [
-        ({}, "RayCaster: give either body or site, and not both"),
-        ({"body": "arn"}, "no body of robot matches 'arn'; did you mean arm"),
-        ({"body": "arm", "alignment": "up"}, "RayCaster.alignment is 'up'; use one of yaw, base, world"),
-        ({"body": "arm", "start": -1.0}, "RayCaster.start is -1.0; use a number of metres >= 0"),
-        ({"body": "arm", "pattern": LidarPattern(count=0)}, "LidarPattern has 0 rays in 1 rows; use 1 to 100,000"),
-        (
-            {"body": "arm", "pattern": LidarPattern(angle=7.0)},
-            "LidarPattern.angle is 7.0; use a number > 0, at most 2 pi",
-        ),
-        ({"body": "arm", "pattern": LidarPattern(elevations=(2.0,))}, "LidarPattern.elevations is [2.0]; use numbers"),
-    ],
-)
-def test_wrong_rays_are_refused_in_one_line(context: SensorContext, options: dict[str, Any], output: str) -> None:
-    assert output in refusal(RayCaster(**options).build, context)
+REFUSED: dict[str, dict[str, Any]] = {
+    "RayCaster: give either body or site, and not both": {},
+    "no body of robot matches 'arn'; did you mean arm": {"body": "arn"},
+    "RayCaster.alignment is 'up'; use one of yaw, base, world": {"body": "arm", "alignment": "up"},
+    "RayCaster.start is -1.0; use a number of metres >= 0": {"body": "arm", "start": -1.0},
+    "LidarPattern has 0 rays in 1 rows; use 1 to 100,000": {"body": "arm", "pattern": LidarPattern(count=0)},
+    "LidarPattern.angle is 7.0; use a number > 0, at most 2 pi": {"body": "arm", "pattern": LidarPattern(angle=7.0)},
+    "LidarPattern.elevations is [2.0]; use numbers": {"body": "arm", "pattern": LidarPattern(elevations=(2.0,))},
+}
+
+
+@pytest.mark.parametrize("output", REFUSED)
+def test_wrong_rays_are_refused_in_one_line(context: SensorContext, output: str) -> None:
+    assert output in refusal(RayCaster(**REFUSED[output]).build, context)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What `muster tasks NAME` tells of every task that comes with Muster is complete: each table has a row for each declared term."""
+"""What `muster tasks NAME` lists of every task that comes with Muster is complete: each table has a row for each declared term."""
 
 from __future__ import annotations
 
@@ -35,61 +35,55 @@ def plan_of(name: str) -> Any:
 
 
 @pytest.mark.parametrize("name", DECLARED)
-def test_each_table_has_each_term_of_the_declaration_and_nothing_else(name: str) -> None:
+def test_each_table_has_each_term_number_and_setting_of_the_task_and_nothing_else(name: str) -> None:
     found, plan = reported(name), plan_of(name)
-    declared = plan.declaration
-    expected = {
-        section: list(getattr(declared, section))
-        for section in ("rewards", "metrics", "terminations", "commands", "events", "curricula", "sensors", "randomize")
-    }
-    expected["actions"] = list(declared.actions)
+    tables, declared = found["tables"], plan.declaration
+    sections = (
+        "rewards",
+        "metrics",
+        "terminations",
+        "commands",
+        "events",
+        "curricula",
+        "sensors",
+        "randomize",
+        "actions",
+    )
+    expected = {section: list(getattr(declared, section)) for section in sections}
     for group, terms in declared.groups.items():
         assert not isinstance(terms, Image)
         expected["observations" if group == "policy" else f"observations of {group}"] = list(terms)
     expected["curriculum"] = list(plan.config.curriculum)
-    rows_of = {
-        section: [row["name"] for row in rows]
-        for section, rows in found["tables"].items()
-        if section not in ("success", "configuration")
-    }
+    apart = ("success", "configuration")
+    rows_of = {section: [row["name"] for row in rows] for section, rows in tables.items() if section not in apart}
     assert rows_of == {section: names for section, names in expected.items() if names}
-    success = found["tables"].get("success", [])
-    assert [[*row.values()] for row in success] == ([[declared.success]] if declared.success else [])
+    assert [[*row.values()] for row in tables.get("success", [])] == ([[declared.success]] if declared.success else [])
 
-
-@pytest.mark.parametrize("name", DECLARED)
-def test_the_columns_weights_and_numbers_are_those_of_the_task(name: str) -> None:
-    found, plan = reported(name), plan_of(name)
-    columns = sum(int(row["columns"]) for row in found["tables"]["observations"])
+    columns = sum(int(row["columns"]) for row in tables["observations"])
     assert columns == len(found["observations"]) == len(plan.names)
-    assert {row["name"]: float(row["weight"]) for row in found["tables"]["rewards"]} == pytest.approx(found["rewards"])
-    values = plan.numbers.values
+    assert {row["name"]: float(row["weight"]) for row in tables["rewards"]} == pytest.approx(found["rewards"])
     for place, (first, count) in plan.numbers.places.items():
-        assert found["numbers"][place] == values[first : first + count]
+        assert found["numbers"][place] == plan.numbers.values[first : first + count]
+
+    settings = {row["name"]: json.loads(row["value"]) for row in tables["configuration"]}
+    of_training = {"rewards", "randomize", "numbers", "curriculum", "ppo", "sac", "rsl_rl"}
+    fields = {item.name for item in dataclasses.fields(plan.config)} - of_training
+    assert {path.partition(".")[0] for path in settings} == fields
+    assert {path: settings[path] for path in settings if "." not in path} == json.loads(
+        json.dumps({field: getattr(plan.config, field) for field in fields & {*settings}})
+    )
+
     console = Console(width=400)
     with console.capture() as captured:
-        for section, rows in found["tables"].items():
+        for section, rows in tables.items():
             console.print(section_of(section, rows).table(rows))
         console.print(NUMBERS.table([*found["numbers"].items()]))
     text = captured.get()
-    for rows in found["tables"].values():
-        assert all(row["name"] in text for row in rows if "name" in row)
+    assert all(row["name"] in text for rows in tables.values() for row in rows if "name" in row)
     assert all(place in text for place in found["numbers"])
 
 
-@pytest.mark.parametrize("name", DECLARED)
-def test_every_setting_of_the_configuration_is_told_but_those_of_training(name: str) -> None:
-    config = plan_of(name).config
-    settings = {row["name"]: json.loads(row["value"]) for row in reported(name)["tables"]["configuration"]}
-    apart = {"rewards", "randomize", "numbers", "curriculum", "ppo", "sac", "rsl_rl"}
-    fields = {item.name for item in dataclasses.fields(config)} - apart
-    assert {path.partition(".")[0] for path in settings} == fields
-    assert {path: settings[path] for path in settings if "." not in path} == json.loads(
-        json.dumps({field: getattr(config, field) for field in fields & {*settings}})
-    )
-
-
-def test_changes_during_training_are_told_by_iteration() -> None:
+def test_changes_during_training_are_listed_by_iteration() -> None:
     points = [[0, -0.01], [499, -0.01], [500, -0.1], [999, -0.1], [1000, -1.0]]
     found = reported("LiftCube")
     assert found["curriculum"] == {"joint_vel_hinge": points}

@@ -89,7 +89,7 @@ def test_a_body_with_an_off_centre_mass_moves_as_mujoco_says(rig: Rig) -> None:
             ("body_angular_velocity_in_own_frame", own[:3]),
         ):
             close(rig.call(term, robot=robot), np.tile(requested, (WORLDS, 1)), term, atol=1e-4)
-    assert np.linalg.norm(world[3:] - of_com[3:]) > 0.1  # else the two velocities could not be told apart
+    assert np.linalg.norm(world[3:] - of_com[3:]) > 0.1  # else the two velocities would look alike
 
 
 def test_every_other_term_of_the_root_is_its_formula(rig: Rig) -> None:

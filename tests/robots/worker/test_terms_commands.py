@@ -328,7 +328,7 @@ def test_terms_of_the_episode(rig: Rig) -> None:
     assert rig.call("not_finite").tolist() == [0, 1, 0]
 
 
-def test_wrenches_are_drawn_from_their_ranges_and_a_frame_is_told_where_to_go(rig: Rig) -> None:
+def test_wrenches_are_drawn_from_their_ranges_and_a_frame_is_moved(rig: Rig) -> None:
     wrench, frame = rig.structs[WrenchArrays], rig.structs[IkArrays]
     rig.call("apply_wrench", stream=3, force=(1.0, 2.0), torque=(-2.0, -1.0))
     drawn = wrench.wrenches.numpy()

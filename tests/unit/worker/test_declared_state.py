@@ -192,7 +192,7 @@ def root_of_place(world: int, worlds: WorldArrays, robot: RobotArrays, joint: in
 
 
 class Measured(Sliders):
-    """A metric that is no number to the left of 0, and what slides and turns in one robot."""
+    """A metric that is not a number to the left of 0, and what slides and turns in one robot."""
 
     def robot(self, config: SlidersConfig) -> Robot:
         return Robot(MODEL.replace('name="second" type="slide"', 'name="second" type="hinge"'))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import fnmatch
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -12,8 +11,6 @@ import warp as wp
 
 from tests.support.worker.tasks import observe, put
 from worker.learning.job import configure
-from worker.learning.setup import describe
-from worker.learning.training import Training
 from worker.settings.errors import UserError
 from worker.tasks import find_task
 from worker.tasks.library.cartpole import Cartpole
@@ -66,22 +63,6 @@ def test_an_action_drives_its_joint_as_declared(task: Task) -> None:
         assert effort.abs().min() > 1.0, "and it is worth comparing"
 
 
-def described(task: Task) -> dict[str, Any]:
-    job: Any = SimpleNamespace(
-        spec={}, section={"task": type(task).__name__}, setting=lambda name, default, **_: default
-    )
-    return describe(Training.of(job, type(task)), task)
-
-
-def test_images_stand_for_themselves_in_the_contract() -> None:
-    kind = find_task("CartpolePixels")
-    task = kind(kind.config_type(), 1)
-    contract = described(task)["contract"]
-    assert contract["groups"][0]["image"]["camera"]["width"] == 64 and not contract["groups"][0]["terms"]
-    assert contract["groups"][0]["image"]["channels"] == ["red", "green", "blue"]
-    assert [action["name"] for action in contract["actions"]] == ["slider"]
-
-
 def observed(randomize: dict[str, Any]) -> Task:
     """512 Quadrupeds that have observed the same state."""
     kind = find_task("Quadruped")
@@ -130,7 +111,7 @@ def test_noise_is_in_the_unit_of_the_quantity_and_leaves_command_and_last_action
         ({"*_velocity": "much"}, ".*_velocity: expected a number of 0 or more, found 'much'"),
     ],
 )
-def test_noise_that_cannot_be_is_refused_in_one_line(noise: Any, message: str) -> None:
+def test_invalid_noise_is_refused_in_one_line(noise: Any, message: str) -> None:
     from worker.learning.job import user_errors
 
     kind = find_task("Quadruped")

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from tests.support.worker.robot_texts import BOX, HINGE, SECOND, mjcf, read, twins
-from worker.simulation import robot_comparison as robot_judge
 from worker.simulation.robot_view import RobotView
 
 URDF = """<robot name="r"><link name="base"/><link name="a"><inertial><origin xyz=".5 0 0"/><mass value="1"/>
@@ -156,14 +155,6 @@ def test_ranges_may_be_open(joint: str, motor: str, limits: tuple[float, float])
     assert RobotView(reading.builder, "").ranges == [limits] and not reading.notes
 
 
-def test_another_end_of_an_open_range_is_found() -> None:
-    files = [mjcf(f'<joint name="j" axis="0 1 0" range="-inf {end}"/>{BOX}') for end in ("1", "2")]
-    first, second = (read(file) for file in files)
-    assert second.reference is not None
-    (found,) = robot_judge.compare(second.reference.model, first.builder).differences
-    assert (found.element, found.field) == ("joint j", "range")
-
-
 @pytest.mark.parametrize(("kind", "is_lost"), [("box", True), ("sphere", False)])
 def test_margins_that_newton_leaves_out_are_noted(kind: str, is_lost: bool) -> None:
     """Of all geoms and contact pairs where one geom is a box."""
@@ -217,29 +208,16 @@ def test_a_mocap_body_stays_where_the_root_moves_freely() -> None:
             r"unknown transmission target 'jj'.*did you mean j\?",
         ),
         (
-            mjcf(HINGE + BOX, '<actuator><position joint="j" kp="nan"/></actuator>'),
-            r"kp='nan' of <position name=''> is not a number",
-        ),
-        (
             mjcf(f'{HINGE}<geom size=".1" mass="0"/>'),
             r"moving bodies must be larger than mjMINVAL Element name 'b'.*give that body",
         ),
-        (mjcf(f'{HINGE}<geom size=".1" mass="-1"/>'), r"negative in geom .*give a value of 0 or more"),
         (
             mjcf(f'<joint name="j" axis="0 1 0" damping=".5 .2"/>{BOX}'),
             r"another robot here: joint j: dampingpoly is \(0 0\), in the file \(0.2 0\)\. Give damping one number",
         ),
         (
-            mjcf(HINGE + BOX, '<actuator><position joint="j" kp="20" nsample="8" delay=".01"/></actuator>'),
-            r"actuator actuator_0: delay is 0, in the file 0.01, and 1 more\. Declare the delay in the task",
-        ),
-        (
             mjcf(f'<joint name="j" type="ball" range="0 1" limited="true"/>{BOX}'),
             r"joint j: limited is False, in the file True",
-        ),
-        (
-            mjcf(f'<joint name="j" type="free" damping=".1"/>{BOX}'),
-            r"joint j: damping is \(0 0 0 0 0 0\), in the file \(0.1 0.1",
         ),
         (urdf("spherical"), r"joint j is of type 'spherical'; URDF has revolute, continuous"),
         (

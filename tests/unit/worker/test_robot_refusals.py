@@ -1,4 +1,4 @@
-"""What is wrong with a robot, its file or the solver's options is said in one line, with what there is."""
+"""What is wrong with a robot, its file or the solver's options is reported in one line, with what exists."""
 
 from __future__ import annotations
 

@@ -110,8 +110,8 @@ def test_what_the_schema_says_is_left_alone(tmp_path: Path) -> None:
         ({"float physics:mass = 3": "", '"PhysicsCollisionAPI"': ""}, {}, r"body /robot/arm moves and has no mass"),
         ({"mass = 3": "mass = -3"}, {}, r"body /robot/arm: its mass is -3, which no body has"),
         ({}, {"arm": "float3 physics:diagonalInertia = (1, 2, 10)"}, r"body /robot/arm: its moments of inertia 1 2 10"),
-        ({"upperLimit = 60": "upperLimit = nan"}, {}, r"joint /robot/j: its limits -30 and nan are no range"),
-        ({"upperLimit = 60": "upperLimit = -40"}, {}, r"joint /robot/j: its limits -30 and -40 are no range"),
+        ({"upperLimit = 60": "upperLimit = nan"}, {}, r"joint /robot/j: its limits -30 and nan are not a range"),
+        ({"upperLimit = 60": "upperLimit = -40"}, {}, r"joint /robot/j: its limits -30 and -40 are not a range"),
         (
             {"def PhysicsRevoluteJoint": "def PhysicsJoint"},
             {},

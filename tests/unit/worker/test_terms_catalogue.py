@@ -23,7 +23,7 @@ from worker.tasks.declare.term_needs import needs_of
 from worker.tasks.terms.aliases import ELSEWHERE, LIBRARIES, aliases, all_terms, meaning_and_names
 
 HELPERS = ("resolve_env_ids",)
-"""Functions of mjlab's modules that are no terms."""
+"""Functions of mjlab's modules that are not terms."""
 NAMES = (REPOSITORY / "tests" / "data" / "former" / "terms.txt").read_text().split()
 """All terms that were ever documented."""
 
@@ -64,23 +64,13 @@ def test_terms_that_no_shipped_task_uses_are_imported_when_one_is_used_and_an_un
         _ = terms.joint_powr
 
 
-def test_a_composed_term_is_a_function_of_its_parts_whose_source_says_no_more_so_that_its_kernels_are_cached() -> None:
-    upright, reset, posture = (getattr(terms, name).func for name in ("upright", "reset_root_on_terrain", "posture"))
-    assert inspect.getsource(upright) == (
+def test_a_composed_term_has_the_needs_and_defaults_of_its_parts_and_a_source_that_is_always_the_same() -> None:
+    assert inspect.getsource(terms.upright.func) == (
         "def upright(world: int, worlds: WorldArrays, robot: RobotArrays, std: float) -> float:\n"
         "    return of_likeness(of_tilt_squared(world, worlds, robot), std)\n"
     )
-    assert list(inspect.signature(reset).parameters)[:7] == [
-        "world",
-        "worlds",
-        "robot",
-        "bodies",
-        "terrain",
-        "stream",
-        "x",
-    ]
-    assert reset.__defaults__ == (wp.vec2(0.0, 0.0),) * 12 and needs_of(terms.reset_root_on_terrain).free_root
-    assert "for joint in range(robot.defaults.shape[0]):" in inspect.getsource(posture)
+    assert terms.reset_root_on_terrain.func.__defaults__ == (wp.vec2(0.0, 0.0),) * 12
+    assert needs_of(terms.reset_root_on_terrain).free_root
 
 
 @pytest.mark.parametrize("library", LIBRARIES)
@@ -106,7 +96,7 @@ def test_a_name_of_another_library_is_our_term_that_names_it_without_a_remark_or
         _ = module.joint_vel_l3
     instead = {"mjlab": ("camera_rgb", "`Image` of a"), "isaaclab": ("modify_env_param", "curriculum")}[library]
     with pytest.raises(
-        AttributeError, match=rf"{instead[0]} is no term here \(docs/tasks/porting.md\): .*{instead[1]}"
+        AttributeError, match=rf"{instead[0]} is not a term here \(docs/tasks/porting.md\): .*{instead[1]}"
     ):
         getattr(module, instead[0])
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -106,81 +105,57 @@ def test_a_yaml_overrides_the_weight_beside_a_term() -> None:
     assert refusal(mine.sketch, wrong) == "config.curriculum.titl: there is no such term; did you mean tilt?"
 
 
-@pytest.mark.parametrize(
-    ("parts", "words"),
-    [
-        ({"reward": {}}, "Cartpole.with_: a declaration has no part reward; did you mean rewards?"),
-        (
-            {"rewards": Reward(tilt)},
-            "Cartpole.with_: rewards is a Reward; give parts by name, such as rewards={'name': …}",
-        ),
-        (
-            {"observations": {"x": Observation(tilt)}},
-            "Cartpole.with_: observations.x is an Observation; observations are by group,",
-        ),
-        (
-            {"config": {"episode_second": 1}},
-            "task Cartpole: config.episode_second: CartpoleConfig has no such key; did",
-        ),
-        (
-            {"config": {"substeps": 0}},
-            "task Cartpole: config.substeps: expected a value greater than or equal to 1, found 0",
-        ),
-        (
-            {"rewards": {"efort": None}},
-            "task Cartpole: rewards.efort: there is nothing of this name to remove; did you mean effort?",
-        ),
-        (
-            {"rewards": {"tilt": Reward(tilt)}},
-            "task Cartpole: rewards.tilt: it has no weight; give it one, such as Reward(…, we",
-        ),
-        (
-            {"rewards": {"tilt": Reward(tilt, weight="much")}},
-            "task Cartpole: rewards.tilt.weight: expected a number, found",
-        ),  # type: ignore[arg-type]
-        ({"rewards": {"tilt": Metric(tilt)}}, "task Cartpole: rewards.tilt: expected a Reward, found a Metric"),
-        (
-            {"metrics": {"tilt": Metric(tilt, scal=2.0)}},
-            "task Cartpole: metrics.tilt: tilt: got an unexpected keyword argument 'scal'",
-        ),
-        (
-            {"metrics": {"tilt": Metric(tilt, joints="hing")}},
-            "task Cartpole: metrics.tilt: no joint of robot matches 'hing'",
-        ),
-        (
-            {"metrics": {"tilt": Metric(tilt, bodies="*")}},
-            "task Cartpole: metrics.tilt: tilt has no parameter bodies; leave",
-        ),
-        ({"sensors": {"feet": ContactSensor}}, "task Cartpole: sensors.feet: "),
-        ({"success": "tlt"}, "task Cartpole: success: no metric and no termination is called tlt"),
-    ],
-)
-def test_an_unknown_or_malformed_part_is_refused_in_one_line(parts: dict[str, Any], words: str) -> None:
+REFUSED: dict[str, dict[str, Any]] = {
+    "Cartpole.with_: a declaration has no part reward; did you mean rewards?": {"reward": {}},
+    "Cartpole.with_: rewards is a Reward; give parts by name, such as rewards={'name': …}": {"rewards": Reward(tilt)},
+    "Cartpole.with_: observations.x is an Observation; observations are by group,": {
+        "observations": {"x": Observation(tilt)}
+    },
+    "task Cartpole: config.episode_second: CartpoleConfig has no such key; did": {"config": {"episode_second": 1}},
+    "task Cartpole: config.substeps: expected a value greater than or equal to 1": {"config": {"substeps": 0}},
+    "task Cartpole: rewards.efort: there is nothing of this name to remove; did you mean effort?": {
+        "rewards": {"efort": None}
+    },
+    "task Cartpole: rewards.tilt: it has no weight; give it one, such as Reward(…, we": {
+        "rewards": {"tilt": Reward(tilt)}
+    },
+    "task Cartpole: rewards.tilt.weight: expected a number, found": {
+        "rewards": {"tilt": Reward(tilt, weight="much")}  # type: ignore[arg-type]
+    },
+    "task Cartpole: rewards.tilt: expected a Reward, found a Metric": {"rewards": {"tilt": Metric(tilt)}},
+    "task Cartpole: metrics.tilt: tilt: got an unexpected keyword argument 'scal'": {
+        "metrics": {"tilt": Metric(tilt, scal=2.0)}
+    },
+    "task Cartpole: metrics.tilt: no joint of robot matches 'hing'": {"metrics": {"tilt": Metric(tilt, joints="hing")}},
+    "task Cartpole: metrics.tilt: tilt has no parameter bodies; leave": {"metrics": {"tilt": Metric(tilt, bodies="*")}},
+    "task Cartpole: sensors.feet: ": {"sensors": {"feet": ContactSensor}},
+    "task Cartpole: success: no metric and no termination is called tlt": {"success": "tlt"},
+}
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_an_unknown_or_malformed_part_is_refused_in_one_line(message: str) -> None:
     def sketch() -> Task:
-        mine = Cartpole.with_(**parts)
+        mine = Cartpole.with_(**REFUSED[message])
         return mine.sketch(mine.config_type())
 
-    assert refusal(sketch).startswith(words)
+    assert refusal(sketch).startswith(message)
 
 
 def test_a_job_finds_it_by_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "poles.py").write_text(
-        "from worker.tasks import Reward, terms\nfrom worker.tasks.library.cartpole import Cartpole\n\n"
-        "Calm = Cartpole.with_(rewards={'calm': Reward(terms.joint_speed, weight=-0.1)})\n"
-        "Wrong = Cartpole.with_(rewrds={})\n" * 1
+    text = (
+        "from worker.tasks import Reward, terms\nfrom worker.tasks.library.cartpole import Cartpole\n"
+        "Calm = Cartpole.with_({}={{'calm': Reward(terms.joint_speed, weight=-0.1)}})\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(
-        ValueError, match=r"^task poles:Calm: \S*poles.py:5: Cartpole.with_: a declaration has no part rewrds; did"
-    ):
-        find_task("poles:Calm")
-    (tmp_path / "poles.py").write_text((tmp_path / "poles.py").read_text().partition("Wrong")[0])
-    sys.modules.pop("poles", None)
-    found = find_task("poles:Calm")
-    assert (found.__name__, found.__module__) == ("Calm", "poles") and found.sketch(found.config_type()).reward_terms[
-        -1
-    ] == "calm"
-    sys.modules.pop("poles", None)
+    for name, part in (("calm_poles", "rewards"), ("wrong_poles", "rewrds")):
+        (tmp_path / f"{name}.py").write_text(text.format(part))
+    found = find_task("calm_poles:Calm")
+    assert (found.__name__, found.__module__) == ("Calm", "calm_poles")
+    assert found.sketch(found.config_type()).reward_terms[-1] == "calm"
+    wrong = r"^task wrong_poles:Calm: \S*poles.py:3: Cartpole.with_: a declaration has no part rewrds; did"
+    with pytest.raises(ValueError, match=wrong):
+        find_task("wrong_poles:Calm")
 
 
 @pytest.fixture

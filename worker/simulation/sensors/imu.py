@@ -86,7 +86,7 @@ def _bias(dynamics: _Dynamics, world: int, body: int) -> wp.spatial_vectorf:
     """Acceleration of a body beyond its parent's from the joints' rates alone: sum of d/dt(axis) times rate over its joints.
 
     The rates are those before the step, which has overwritten them since: they are taken from the bodies' velocities. Several joints
-    on one body can't be told apart there, and their rates are calculated back from the acceleration.
+    on one body can't be separated there, and their rates are calculated back from the acceleration.
     """
     first = dynamics.body_dofadr[body]
     count = dynamics.body_dofnum[body]

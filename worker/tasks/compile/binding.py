@@ -147,7 +147,7 @@ class Binder:
 
     def _bind_torch(self, place: str, term: Term) -> Bound:
         if not callable(term.function):
-            raise ValueError(f"{place}: {shown(term.function)} is no function; {_function_instead(term.function)}")
+            raise ValueError(f"{place}: {shown(term.function)} is not a function; {_function_instead(term.function)}")
         bound = Bound(place, term, None, width=term.size or 1)
         found = inspect.signature(term.function)
         for element, name in _PLURALS.items():
@@ -403,7 +403,7 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
 
 
 def _function_instead(supplied: Any) -> str:
-    """What a term takes instead of a value that is no function; for the name of a function, that function."""
+    """What a term takes instead of a value that is not a function; for the name of a function, that function."""
     known = [f"terms.{name}" for name in dir(terms) if is_warp(getattr(terms, name))]
     meant = f"terms.{supplied.removeprefix('terms.')}" if isinstance(supplied, str) else ""
     anything = "a term is a @wp.func, or a Python function of the task that gives a tensor"

@@ -34,7 +34,7 @@ def cameras(
     for group, image in declaration.images.items():
         if image.sensor not in known:
             hint = nearest(image.sensor, known) if known else "the task declares none; give it a CameraSensor"
-            no_camera = f"the sensor {image.sensor} is no camera"
+            no_camera = f"the sensor {image.sensor} is not a camera"
             what = no_camera if image.sensor in sensors else f"there is no camera {image.sensor!r}"
             raise ValueError(f"observations.{group}: {what}; {hint}")
     for name in known:
@@ -50,7 +50,7 @@ def _check_groups(config: TaskConfig, declaration: Declaration) -> None:
     for group in declaration.images:
         if not groups.get(group, False):
             raise ValueError(
-                f"observations.{group}: it is an image, and {kind} does not say so; give {kind} a "
+                f"observations.{group}: it is an image, and {kind} does not declare it; give {kind} a "
                 f'further_groups: ClassVar = {{"{group}": True}}'
             )
     for group, is_image in config.further_groups.items():

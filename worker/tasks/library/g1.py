@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from worker.settings.velocity import G1FlatConfig, G1RoughConfig, VelocityConfig
 from worker.simulation.declared_randomization import Randomize
 from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.height_scan import RingPattern
 from worker.tasks import terms
-from worker.tasks.declare.declaration import Reward
 from worker.tasks.library.robots.g1 import ACTION_SCALE, FEET, g1
+from worker.tasks.library.robots.mjlab import walking
 from worker.tasks.library.velocity import Velocity, Walker, rate
 
 G1 = Walker(
@@ -60,13 +59,7 @@ G1 = Walker(
     ),
     randomize={
         "foot_friction": Randomize("friction", geoms=FEET, range=(0.3, 1.2), operation="set", shared=True),
-        "encoder_bias": Randomize("encoder_bias", joints="*", range=(-0.015, 0.015), operation="add"),
-        "base_com": Randomize(
-            "center_of_mass",
-            bodies="torso_link",
-            range={"x": (-0.025, 0.025), "y": (-0.025, 0.025), "z": (-0.03, 0.03)},
-            operation="add",
-        ),
+        **walking("torso_link"),
     },
 )
 
@@ -87,16 +80,12 @@ class G1Flat(Velocity):
         "nconmax": 64,
         "njmax": 230,
     }
-
-    def sensors_of(self, config: VelocityConfig) -> Mapping[str, Any]:
-        """Also the robot's contacts with itself."""
-        touching = ContactSensor(bodies="*", against="robot", fine=True, together=True)
-        return {**super().sensors_of(config), "self_contacts": touching}
-
-    def rewards_of(self, config: VelocityConfig) -> Mapping[str, Reward]:
-        """Also a cost of contacts with itself."""
-        collisions = rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0)
-        return {**super().rewards_of(config), "self_collisions": collisions}
+    changes = (  # contacts with itself
+        {
+            "sensors": {"self_contacts": ContactSensor(bodies="*", against="robot", fine=True, together=True)},
+            "rewards": {"self_collisions": rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0)},
+        },
+    )
 
 
 class G1Rough(G1Flat):

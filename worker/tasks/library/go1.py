@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from worker.settings.velocity import Go1FlatConfig, Go1RoughConfig, VelocityConfig
-from worker.simulation.declared_randomization import Randomize
 from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.height_scan import RingPattern
 from worker.tasks import terms
-from worker.tasks.declare.declaration import Reward, Termination
+from worker.tasks.declare.declaration import Termination
 from worker.tasks.library.robots.go1 import ACTION_SCALE, FEET, go1
+from worker.tasks.library.robots.mjlab import friction, walking
 from worker.tasks.library.velocity import Velocity, Walker, rate
 
 GO1 = Walker(
@@ -25,43 +24,14 @@ GO1 = Walker(
     touching=ContactSensor(geoms=FEET, fine=True),
     ring=RingPattern(radius=0.04, count=4, center=True),
     tolerances=terms.Tolerances(standing={"*_calf_joint": 0.1, "*": 0.05}, walking={"*_calf_joint": 0.6, "*": 0.3}),
-    randomize={
-        "foot_friction_slide": Randomize(
-            "friction", geoms=FEET, axes=("slide",), range=(0.3, 1.5), operation="set", shared=True
-        ),
-        "foot_friction_spin": Randomize(
-            "friction",
-            geoms=FEET,
-            axes=("torsion",),
-            range=(1e-4, 2e-2),
-            operation="set",
-            distribution="log_uniform",
-            shared=True,
-        ),
-        "foot_friction_roll": Randomize(
-            "friction",
-            geoms=FEET,
-            axes=("roll",),
-            range=(1e-5, 5e-3),
-            operation="set",
-            distribution="log_uniform",
-            shared=True,
-        ),
-        "encoder_bias": Randomize("encoder_bias", joints="*", range=(-0.015, 0.015), operation="add"),
-        "base_com": Randomize(
-            "center_of_mass",
-            bodies="trunk",
-            range={"x": (-0.025, 0.025), "y": (-0.025, 0.025), "z": (-0.03, 0.03)},
-            operation="add",
-        ),
-    },
+    randomize={**friction("foot_friction", FEET, shared=True), **walking("trunk")},
 )
 
 
 class Go1Flat(Velocity):
     """Go1 on a plane: 48 observations, 12 actions, 50 control steps a second, episodes of 20 s."""
 
-    config_type = Go1FlatConfig
+    config_type: ClassVar[type[VelocityConfig]] = Go1FlatConfig
     walker = GO1
     solver_options = {
         "integrator": "implicitfast",
@@ -77,11 +47,15 @@ class Go1Flat(Velocity):
     }
 
 
-class Go1Rough(Velocity):
+def hits(against: str = "ground", **what: Any) -> ContactSensor:
+    """Contacts of parts of the robot, in every physics step and in one column."""
+    return ContactSensor(against=against, fine=True, together=True, **what)
+
+
+class Go1Rough(Go1Flat):
     """Go1 on stairs, slopes and rough ground, which it sees: 235 observations, 12 actions, 50 control steps a second, episodes of 20 s."""
 
     config_type = Go1RoughConfig
-    walker = GO1
     rough = True
     solver_options = {
         **Go1Flat.solver_options,
@@ -90,35 +64,27 @@ class Go1Rough(Velocity):
         "nconmax": 40,
         "njmax": 160,
     }
-
-    def sensors_of(self, config: VelocityConfig) -> Mapping[str, Any]:
-        """Also contacts of other parts with the ground, and of the robot with itself."""
-
-        def hits(against: str = "ground", **what: Any) -> ContactSensor:
-            return ContactSensor(against=against, fine=True, together=True, **what)
-
-        return {
-            **super().sensors_of(config),
-            "self_contacts": hits("robot", bodies="*"),
-            "thighs": hits(geoms="*_thigh_collision[123]"),
-            "shanks": hits(geoms="*_calf_collision[12]"),
-            "trunk_head": hits(geoms=("trunk_collision", "head_collision")),
-        }
-
-    def rewards_of(self, config: VelocityConfig) -> Mapping[str, Reward]:
-        """Upright relative to the slope of the ground, with costs of contacts other than the feet's."""
-        return {
-            **super().rewards_of(config),
-            "upright": rate(
-                terms.body_upright_on_ground, bodies=self.walker.torso, scan="terrain_scan", std=math.sqrt(0.2)
-            ),
-            "self_collisions": rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0),
-            "shank_collision": rate(terms.hard_contact_steps, contacts="shanks", force=10.0),
-            "trunk_head_collision": rate(terms.hard_contact_steps, contacts="trunk_head", force=10.0),
-        }
-
-    def terminations_of(self, config: VelocityConfig) -> Mapping[str, Termination]:
-        """Contact of a thigh with the ground, instead of a tilt limit."""
-        ends = dict(super().terminations_of(config))
-        del ends["fell_over"]
-        return {**ends, "illegal_contact": Termination(terms.illegal_contact, contacts="thighs", force=10.0)}
+    changes = (
+        {
+            "sensors": {
+                "self_contacts": hits("robot", bodies="*"),
+                "thighs": hits(geoms="*_thigh_collision[123]"),
+                "shanks": hits(geoms="*_calf_collision[12]"),
+                "trunk_head": hits(geoms=("trunk_collision", "head_collision")),
+            },
+            "rewards": {
+                # relative to the slope of the ground
+                "upright": rate(
+                    terms.body_upright_on_ground, bodies=GO1.torso, scan="terrain_scan", std=math.sqrt(0.2)
+                ),
+                "self_collisions": rate(terms.hard_contact_steps, contacts="self_contacts", force=10.0),
+                "shank_collision": rate(terms.hard_contact_steps, contacts="shanks", force=10.0),
+                "trunk_head_collision": rate(terms.hard_contact_steps, contacts="trunk_head", force=10.0),
+            },
+            # a thigh on the ground ends the episode, not a tilt
+            "terminations": {
+                "fell_over": None,
+                "illegal_contact": Termination(terms.illegal_contact, contacts="thighs", force=10.0),
+            },
+        },
+    )

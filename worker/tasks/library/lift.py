@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from worker.settings.lift import LiftCubeConfig
-from worker.simulation.declared_randomization import Distribution, Randomize
 from worker.simulation.objects import Box
 from worker.simulation.robot import Robot
 from worker.simulation.sensors.contact import ContactSensor
@@ -22,17 +21,12 @@ from worker.tasks.declare.declaration import (
     Reward,
     Termination,
 )
+from worker.tasks.library.robots.mjlab import friction
 from worker.tasks.library.robots.yam import ACTION_SCALE, FINGERTIPS, GRASP, GRIPPER, yam
 from worker.tasks.run.task import Task
 
 EDGE = 0.04
 """Length of the cube's edges [m]."""
-FINGERTIP_FRICTION: tuple[tuple[str, str, tuple[float, float], Distribution], ...] = (
-    ("slide", "slide", (0.3, 1.5), "uniform"),
-    ("spin", "torsion", (1.0e-4, 2.0e-2), "log_uniform"),
-    ("roll", "roll", (1.0e-5, 5.0e-3), "log_uniform"),
-)
-"""Sliding, torsional [m] and rolling [m] coefficients of each fingertip sphere, drawn once for each world."""
 
 
 class LiftCube(Task):
@@ -131,10 +125,5 @@ class LiftCube(Task):
                 )
             },
             events={"reset_robot": Event(terms.reset_to_default)},
-            randomize={
-                f"fingertip_friction_{name}": Randomize(
-                    "friction", geoms=FINGERTIPS, axes=(axis,), range=ends, operation="set", distribution=distribution
-                )
-                for name, axis, ends, distribution in FINGERTIP_FRICTION
-            },
+            randomize=friction("fingertip_friction", FINGERTIPS, shared=False),
         )

@@ -83,7 +83,7 @@ class Walker:
 
 
 class Velocity(Task):
-    """A robot that follows velocity commands; a subclass names the robot, its ground, and further terms on rough ground."""
+    """A robot that follows velocity commands; a subclass names the robot, its ground, and in ``changes`` what else differs."""
 
     ground = True
     walker: ClassVar[Walker]
@@ -127,7 +127,7 @@ class Velocity(Task):
         super().begin_iteration(iteration, reward, episode_length)
 
     def declare(self, config: VelocityConfig) -> Declaration:
-        """The terms that all robots share, and those of the subclass."""
+        """The terms that all robots share; ``changes`` has those of one."""
         return Declaration(
             actions={
                 "joint_pos": Action(
@@ -139,8 +139,8 @@ class Velocity(Task):
                 )
             },
             observations={"policy": self._seen(noisy=True), "critic": {**self._seen(noisy=False), **self._known()}},
-            rewards=self.rewards_of(config),
-            terminations=self.terminations_of(config),
+            rewards=self._rewards(config),
+            terminations=self._terminations(config),
             commands={"twist": self._command(config)},
             events=self._events(config),
             curricula=(
@@ -154,12 +154,11 @@ class Velocity(Task):
                 "error_vel_yaw": Metric(terms.turning_velocity_error),
                 **({"terrain_level": Metric(terms.terrain_level)} if self.rough else {}),
             },
-            sensors=self.sensors_of(config),
+            sensors=self._sensors(config),
             randomize=self.walker.randomize,
         )
 
-    def sensors_of(self, config: VelocityConfig) -> Mapping[str, Any]:
-        """The sensors; a subclass adds its own."""
+    def _sensors(self, config: VelocityConfig) -> Mapping[str, Any]:
         walker = self.walker
         sensors: dict[str, Any] = {
             "imu": Imu(site=walker.imu),
@@ -174,8 +173,8 @@ class Velocity(Task):
             sensors["terrain_scan"] = HeightScan(bodies=walker.base, pattern=pattern, max_distance=FARTHEST_SCAN)
         return sensors
 
-    def rewards_of(self, config: VelocityConfig) -> Mapping[str, Reward]:
-        """The rewards, each per second; a subclass adds its own."""
+    def _rewards(self, config: VelocityConfig) -> Mapping[str, Reward]:
+        """The rewards, each per second."""
         walker, points = self.walker, self.walker.foot_points
         return {
             "track_linear_velocity": rate(terms.track_linear_velocity, std=math.sqrt(0.25)),
@@ -203,8 +202,8 @@ class Velocity(Task):
             "soft_landing": rate(terms.soft_landing, contacts="feet", threshold=MOVES),
         }
 
-    def terminations_of(self, config: VelocityConfig) -> Mapping[str, Termination]:
-        """The terminations: a fall, and as a time-out the end of the terrain; a subclass may change them."""
+    def _terminations(self, config: VelocityConfig) -> Mapping[str, Termination]:
+        """A fall, and as a time-out the end of the terrain."""
         ends = {"fell_over": Termination(terms.root_tilted, limit=math.radians(70.0))}
         if terrain := self.terrain(config):
             margin = terrain.border - UNSEEN

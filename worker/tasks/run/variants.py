@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_parts(task: type[TaskSketch], parts: Mapping[str, Any]) -> None:
-    """Raise ValueError for a section that a declaration does not have, and for one that is no mapping of parts by name."""
+    """Raise ValueError for a section that a declaration does not have, and for one that is not a mapping of parts by name."""
     known = [item.name for item in dataclasses.fields(Declaration)]
     for section, part in parts.items():
         where = f"{task.__name__}.with_"

@@ -36,7 +36,7 @@ ELSEWHERE = """\
 | `reset_nodal_state_uniform` | Isaac Lab | nothing like it: there are no soft bodies |
 | `OperationalSpaceControllerAction`, `NonHolonomicAction`, `SurfaceGripperBinaryAction` | Isaac Lab | nothing like it |
 """
-"""Names that are no terms here, their library, and what to use instead: rows of a table in Markdown."""
+"""Names that are not terms here, their library, and what to use instead: rows of a table in Markdown."""
 _NAMES = re.compile(r"(?:^|(?<=\.)|(?<=\n))\s*(mjlab|mjlab, Isaac Lab|Isaac Lab): (.*)\.\s*$", re.DOTALL)
 
 
@@ -84,5 +84,5 @@ def term_named(library: str, name: str) -> wp.Function:
         names, owner, instead = (each.strip() for each in row.strip("|").split(" | "))
         if owner == LIBRARIES[library] and name in re.findall(r"`(\w+)`", names):
             plain = re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", instead)
-            raise AttributeError(f"{owner}'s {name} is no term here (docs/tasks/porting.md): {plain}")
+            raise AttributeError(f"{owner}'s {name} is not a term here (docs/tasks/porting.md): {plain}")
     raise AttributeError(f"no term has the name {name!r} in {LIBRARIES[library]}; {nearest(name, list(known))}")

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from worker.simulation.actuators import PositionActuator
+from worker.simulation.declared_randomization import Distribution, Randomize
 
 VERSION = "1.6.0"
 """The mjlab release whose numbers these robots and their tasks use."""
@@ -62,3 +63,30 @@ def action_scale(servos: Sequence[PositionActuator]) -> Mapping[str, float]:
         for pattern in [each.joints] if isinstance(each.joints, str) else each.joints:
             scales[pattern] = ACTION_SHARE * each.effort_limit / each.stiffness
     return scales
+
+
+FRICTION: tuple[tuple[str, str, tuple[float, float], Distribution], ...] = (
+    ("slide", "slide", (0.3, 1.5), "uniform"),
+    ("spin", "torsion", (1.0e-4, 2.0e-2), "log_uniform"),
+    ("roll", "roll", (1.0e-5, 5.0e-3), "log_uniform"),
+)
+"""Sliding, torsional [m] and rolling [m] coefficients of the spheres of feet and fingertips: mjlab's name, axis, range, distribution."""
+
+
+def friction(name: str, geoms: str | tuple[str, ...], *, shared: bool) -> Mapping[str, Randomize]:
+    """Entries ``name_slide``, ``name_spin`` and ``name_roll``, drawn once for each world: of all geoms if ``shared``, or of each."""
+    return {
+        f"{name}_{each}": Randomize(
+            "friction", geoms=geoms, axes=(axis,), range=ends, operation="set", distribution=distribution, shared=shared
+        )
+        for each, axis, ends, distribution in FRICTION
+    }
+
+
+def walking(torso: str) -> Mapping[str, Randomize]:
+    """The encoders' bias of a legged robot [rad], and the place of its torso's centre of mass [m]."""
+    place = {"x": (-0.025, 0.025), "y": (-0.025, 0.025), "z": (-0.03, 0.03)}
+    return {
+        "encoder_bias": Randomize("encoder_bias", joints="*", range=(-0.015, 0.015), operation="add"),
+        "base_com": Randomize("center_of_mass", bodies=torso, range=place, operation="add"),
+    }
