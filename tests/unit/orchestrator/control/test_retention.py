@@ -24,7 +24,6 @@ from orchestrator.persistence.batch_models import (
     Attempt,
     Dependency,
     JobDefinition,
-    JobQueue,
     Node,
     RunRecord,
     now,
@@ -59,29 +58,6 @@ def test_a_pass_takes_old_jobs_of_the_batch_api_with_their_runs_and_nothing_else
     with world.database.session() as session:
         assert sorted(session.scalars(select(RunRecord.name))) == ["native", "young"]
         assert sorted(session.scalars(select(Node.job_id))) == sorted(session.scalars(select(Attempt.job_id)))
-
-
-def test_a_dry_run_tells_what_would_go_and_how_much_and_takes_nothing(world: World) -> None:
-    world.ended("old")
-    world.ended("kept")
-    contents.archive(world.store.run("kept"), "key a")
-    looks, following = world.step(take=False)
-    assert following is None and world.jobs() == ["kept", "old"] and world.runs() == ["kept", "old"]
-    found = {each["run"]: each for each in looks}
-    assert (found["old"]["jobs"], found["old"]["whole"], found["old"]["files"]) == (["old"], True, 3)
-    assert found["old"]["bytes"] > 1000 and found["old"]["kept"] == []
-    assert (found["kept"]["jobs"], found["kept"]["kept"]) == ([], ["it is archived (by key a)"])
-
-
-def test_results_keep_the_run_and_its_logs_go_with_the_job(world: World) -> None:
-    world.ended("old")
-    (world.store.run("old").path / "results.csv").write_text("1,2")
-    world.retention().take_all()
-    run = world.store.run("old").path
-    assert world.jobs() == [] and sorted(os.listdir(run)) == ["logs", "outcomes", "results.csv", "run.json"]
-    assert os.listdir(run / "logs") == os.listdir(run / "outcomes") == []
-    with world.database.session() as session:
-        assert session.scalars(select(RunRecord.name)).all() == ["old"], "it still has its owner"
 
 
 @pytest.mark.parametrize(
@@ -125,13 +101,6 @@ def test_a_job_that_uses_a_run_is_one_of_its_open_jobs(world: World) -> None:
     assert world.retention().open_job("old") is None
     world.add(job("reader", status="RUNNABLE"), RunUse(job_id="reader", run="old"))
     assert world.retention().open_job("old") == "reader"
-
-
-def test_a_reader_that_has_ended_keeps_nothing(world: World) -> None:
-    world.ended("old")
-    world.add(job("reads", status="FAILED", stopped_at=now()), RunUse(job_id="reads", run="old"))
-    world.retention().take_all()
-    assert world.jobs() == ["reads"] and world.runs() == []
 
 
 def test_the_jobs_of_an_array_go_when_all_of_them_are_old_enough(world: World) -> None:
@@ -281,44 +250,6 @@ def test_a_controller_that_ends_amid_a_step_leaves_the_rows_to_the_next_one(
 # -- rules, owners, definitions -----------------------------------------------------------------------------------------
 
 
-def test_rules_of_queues_and_of_the_controller(world: World) -> None:
-    day = now() - A_DAY
-    for queue, tags in (
-        ("short", {"muster:retention": "2h"}),
-        ("kept", {"muster:retention": "off"}),
-        ("bad", {"muster:retention": "x"}),
-    ):
-        world.add(JobQueue(name=queue, compute_environments=["local"], tags=tags))
-    # with a queue that was deleted its rule went, which may have been to keep its jobs
-    for queue in ("default", "short", "kept", "bad", "deleted"):
-        world.ended(queue, queue=queue, stopped_at=day, from_yaml=True)
-    assert world.retention(default=inf).take_all().jobs == 1 and world.jobs() == ["bad", "default", "deleted", "kept"]
-    assert world.retention(default=2 * 86_400).take_all().jobs == 0
-    looks, _ = world.step(take=True, default=A_DAY // 2)
-    assert [each["jobs"] for each in looks] == [["default"]]
-    world.ended("default", stopped_at=day, from_yaml=True)
-    assert world.retention(default=3600).take_all().jobs == 1 and world.jobs() == ["bad", "deleted", "kept"]
-    world.add(JobQueue(name="deleted", compute_environments=["local"], tags={"muster:retention": "1m"}))
-    assert world.retention().take_all().jobs == 1 and world.jobs() == ["bad", "kept"], "created again, with a rule"
-
-
-def test_a_switch_turns_it_off(world: World) -> None:
-    world.ended("old")
-    calls: list[Callable[[], object]] = []
-    off, on = world.retention(default=inf), world.retention()
-    for each in (off, on):
-        each._next = 0.0
-        each.when_due(calls.append)
-        each.when_due(calls.append)
-    assert len(calls) == 2, "one pass of each at a time"
-    calls[0]()
-    assert world.jobs() == ["old"]
-    calls[1]()
-    assert world.jobs() == []
-    on.when_due(calls.append)
-    assert len(calls) == 2, "the next pass comes later"
-
-
 def test_in_the_first_days_after_an_upgrade_it_only_logs(world: World, caplog: pytest.LogCaptureFixture) -> None:
     world.ended("old")
     world.add(RetentionStart(id=1, since=now() - 2 * A_DAY))
@@ -373,14 +304,3 @@ def test_definitions_go_with_their_last_job_where_no_user_needs_them(world: Worl
     with world.database.session() as session:
         left = [(each.name, each.revision) for each in session.scalars(select(JobDefinition))]
     assert sorted(left) == [("client", 2), ("client", 3), ("used", 1)], "no number of a client's is given twice"
-
-
-def test_a_run_is_deleted_whole_and_its_jobs_stay_in_the_history(world: World) -> None:
-    world.ended("old", stopped_at=now(), from_yaml=True)
-    (world.store.run("old").path / "results.csv").write_text("1")
-    deleted = world.retention().delete("old")
-    assert deleted["files"] == 4 and world.runs() == [] and world.trashed() == []
-    assert world.jobs() == ["old"]
-    with world.database.session() as session:
-        assert session.get(RunRecord, "old") is None, "a new run of the name has an owner of its own"
-    assert world.retention().delete("old")["files"] == 0

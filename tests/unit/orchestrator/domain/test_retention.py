@@ -59,15 +59,6 @@ def test_nothing_of_a_run_goes_while_something_needs_it(
     assert list(decision.reasons) == still_needed(run, [OLD, *jobs], references)
 
 
-def test_a_plug_in_that_can_t_be_asked_keeps_every_run_and_every_job_for_one_reason() -> None:
-    unknown = References.of([], [], ["plug-in x is not installed"])
-    assert still_needed(RUN, [OLD, JobFacts("young")], unknown) == ["plug-in x is not installed"]
-    assert decide(None, [OLD, JobFacts("other", is_due=True)], unknown) == Decision(
-        False, (), ("plug-in x is not installed",)
-    )
-    assert (unknown | NOTHING).unknown == (NOTHING | unknown).unknown == unknown.unknown
-
-
 @pytest.mark.parametrize(
     ("facts", "jobs", "reason"),
     [

@@ -129,15 +129,6 @@ def test_a_definition_is_read_once_however_often_its_row_is_loaded_until_the_row
     assert len(gangs.of("j", properties(2)).nodes) == 2
 
 
-def test_only_the_definitions_used_last_are_remembered() -> None:
-    gangs = Gangs(most=2)
-    a, b = gangs.of("a", properties(1)), gangs.of("b", properties(1))
-    assert gangs.of("a", properties(1)) is a
-    gangs.of("c", properties(1))
-    assert gangs.of("a", properties(1)) is a
-    assert gangs.of("b", properties(1)) is not b
-
-
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     return Store(tmp_path / "store").open().run("r")
@@ -248,10 +239,3 @@ def test_an_array_is_asked_to_end_by_the_request_that_asked_its_children(
         for reason in (request, "again"):
             ask_to_end(session, or_(Job.id == "a", Job.parent == "a"), reason, cancel=request == "c")
     assert stops(session) == [array, *ends]
-
-
-def test_a_child_that_is_ended_alone_leaves_its_array_alone(session: Session) -> None:
-    session.add_all([job("a", kind="array", status="PENDING"), job("a:0", parent="a"), job("a:1", parent="a")])
-    session.commit()
-    ask_to_end(session, Job.id == "a:1", "c", cancel=True)
-    assert stops(session) == [_LEFT, _LEFT, _CANCELLED]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from sqlalchemy import event, insert
+from sqlalchemy import insert
 from sqlalchemy.orm import Session
 
 from orchestrator.domain.job import Status
@@ -85,16 +85,6 @@ def test_a_lookup_costs_the_same_with_many_jobs(database: Database, look: str) -
         connection.exec_driver_sql("DELETE FROM jobs WHERE created_at = 1")
     fill(database, 3000)
     assert steps() <= 2 * few + 50
-
-
-def test_the_beginning_of_an_array_s_id_is_not_that_of_its_children(database: Database) -> None:
-    fill(database, 20)
-    statements: list[str] = []
-    event.listen(database.engine, "before_cursor_execute", lambda *reported: statements.append(reported[2]))
-    with database.session() as session:
-        found = find_job(session, "aaaaaaaa")
-        assert found is not None and found.id == ARRAY
-    assert any("LIMIT" in statement for statement in statements)
 
 
 NAMED = {

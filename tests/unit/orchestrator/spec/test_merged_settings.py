@@ -102,22 +102,6 @@ def test_an_unknown_task_is_left_to_its_rank(tmp_path: Path) -> None:
         load(job(tmp_path, "my_task:Task", algorithm, settings))
 
 
-@pytest.mark.parametrize(
-    ("algorithm", "settings", "key", "found"),
-    [
-        ("rsl_rl", "algorithm: {max_grad_norm: .inf}", "algorithm.max_grad_norm", "inf"),
-        ("rsl_rl", "actor: {hidden_dims: [8, -.inf]}", "actor.hidden_dims.1", "-inf"),
-        ("sac", "v_max: .inf", "v_max", "inf"),
-    ],
-)
-def test_a_number_that_json_does_not_have_is_refused_wherever_it_stands(
-    tmp_path: Path, algorithm: str, settings: str, key: str, found: str
-) -> None:
-    path = job(tmp_path, "Ant", algorithm, settings)
-    output = f"{path}:8: train.{algorithm}.{key}: expected a finite number, found a number ({found})"
-    assert refusal(load, path, error=SpecError) == output
-
-
 def test_settings_of_another_algorithm_are_refused_by_their_key(tmp_path: Path) -> None:
     file = tmp_path / "job.yaml"
     text = "name: a\ntrain:\n  task: Ant\n  worlds: 4\n  iterations: 2\n  algorithm: {}\n  {}: {{epochs: 3}}\n"

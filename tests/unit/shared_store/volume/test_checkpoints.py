@@ -364,14 +364,6 @@ def test_retention_keeps(run: Run, case: str) -> None:
     assert names(run) == [f"{iteration:08d}-e1" for iteration in kept]
 
 
-def test_a_damaged_manifest_does_not_keep_the_next_commit_from_being_made(run: Run) -> None:
-    for iteration in (10, 20, 30):
-        commit(run, iteration)
-    (run.checkpoints / "00000010-e1" / "manifest.json").write_text("{")
-    commit(run, 40, keep=2)
-    assert names(run) == ["00000030-e1", "00000040-e1"]
-
-
 def test_the_best_has_the_greatest_score_that_is_a_number_and_of_equals_it_is_the_later(run: Run) -> None:
     assert best_checkpoint(run) is None
     commit(run, 1, reward=9.0)

@@ -60,18 +60,6 @@ def test_a_run_has_the_name_of_a_directory_and_can_not_leave_the_store_by_it(tmp
         Store(tmp_path).run(name)
 
 
-def test_everything_of_a_run_lies_where_the_design_says(tmp_path: Path) -> None:
-    run = Store(tmp_path).run("ant")
-    base = tmp_path / "runs" / "ant"
-    assert run.checkpoints == base / "checkpoints"
-    assert run.metrics == base / "metrics"
-    assert run.evaluations == base / "evaluations"
-    assert run.exports == base / "exports"
-    assert run.log("job", 2, 1) == base / "logs" / "job" / "2" / "node-1.log"
-    assert run.outcome("job", 2, 1) == base / "outcomes" / "job" / "2" / "node-1.json"
-    assert list(tmp_path.iterdir()) == [], "asking for a path creates nothing"
-
-
 def test_runs_keep_their_descriptions_and_are_listed_by_name_only_if_they_were_created(tmp_path: Path) -> None:
     store = Store(tmp_path)
     assert store.runs() == [] and store.run("a").description() is None

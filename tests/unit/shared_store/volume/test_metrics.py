@@ -44,13 +44,6 @@ def test_a_written_record_is_read_at_once(run: Run) -> None:
     assert len(read_metrics(run)) == 1
 
 
-def test_the_tenth_attempt_follows_the_ninth(run: Run) -> None:
-    attempt(run, 9, 0, 4)
-    attempt(run, 10, 2, 6)
-    assert history(run) == [(1, 9), (2, 9), (3, 10), (4, 10), (5, 10), (6, 10)]
-    assert [record["iteration"] for record in read_metrics(run, after=2)] == [3, 4, 5, 6]
-
-
 @pytest.mark.parametrize("torn", [b"{", b'{"iteration": 3, "epoch"', b'{"iteration": 3, "epoch": 1}', b"\0\0\0\0"])
 def test_a_last_line_that_a_crash_cut_short_is_passed_over(run: Run, torn: bytes) -> None:
     attempt(run, 1, 0, 2)
@@ -166,14 +159,6 @@ def test_a_page_of_a_long_history_is_read_without_the_rest(run: Run, parsed: lis
 
 def points(run: Run, *arguments: int) -> list[tuple[int, int]]:
     return [(record["iteration"], record["epoch"]) for record in sampled(run, *arguments)]
-
-
-def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(run: Run) -> None:
-    assert sampled(run) == []
-    attempt(run, 1, 0, 0)
-    assert sampled(run) == []
-    attempt(run, 2, 0, 7)
-    assert points(run) == [(i, 2) for i in range(1, 8)]
 
 
 def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_record(run: Run) -> None:
