@@ -113,13 +113,6 @@ def test_memory_is_bounded_and_a_slow_reader_goes_on_in_the_files(job: Followed)
     assert [int(each.split()[0]) for each in job.read()] == list(range(400))
 
 
-def test_more_than_one_look_reads_is_left_to_the_readers(job: Followed) -> None:
-    job.write(*(f"{number} " + "x" * 1000 for number in range(3000)), push=False)
-    job.state()
-    assert job.logs.look() and not job.logs._tails[LOG].data
-    assert [int(each.split()[0]) for each in job.read()] == list(range(3000))
-
-
 def test_a_reader_that_comes_too_late_hears_what_was_left_out(tmp_path: Path) -> None:
     job = Followed(tmp_path / "run", LEAST_LOG_LIMIT)
     for number in range(1500):

@@ -172,15 +172,6 @@ def test_while_the_engine_does_not_answer_nothing_is_lost_and_its_time_does_not_
     assert cluster.lost() == [1]
 
 
-def test_an_answer_from_before_the_silence_is_none() -> None:
-    cluster = Cluster(3)
-    cluster.silence(1)
-    for _ in range(300):
-        cluster.time += 1.0
-        silence = cluster.presence.silence(cluster.nodes[1], cluster.time - 999.0)
-    assert silence is not None and not silence.is_lost
-
-
 def test_a_node_that_only_an_earlier_controller_met_is_unreachable_until_it_comes_and_never_lost() -> None:
     cluster, early, late, ended = Cluster(3), ("job-9", 1, 0), ("job-9", 1, 1), ("job-9", 1, 2)
     cluster.presence.expect("job-9", 1, 4, met=[0, 1, 2])
