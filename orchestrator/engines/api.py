@@ -230,7 +230,7 @@ class NodeStatus:
     address: str = ""
     words: str = ""
     """For people; nothing is decided by them. Why it does not run yet or can't be seen (then they are never empty); of one that has
-    ended, what its supervisor said where it could not say it in the store, or what the engine says of its end."""
+    ended, what its supervisor printed where it could not write to the store, or what the engine says of its end."""
     cause: Cause | None = None
     """The cause of its end; None while it runs, or if the engine can't say."""
     exit_code: int | None = None
@@ -365,7 +365,7 @@ class Engine(Protocol):
         """``Hosts`` to place gangs on, or ``Queued`` of an engine that queues and places them by itself: always the same of the two.
 
         Names of hosts begin with the engine's and a slash. Until the first answer the engine's jobs wait, and its controller goes
-        on without it. Raises EngineError where it can't be told now: the last answer counts, and the engine's health says why.
+        on without it. Raises EngineError where it isn't known now: the last answer counts, and the engine's health says why.
         """
         ...
 

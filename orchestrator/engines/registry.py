@@ -77,7 +77,7 @@ class EngineSet:
         return sorted({engine.address for engine in self.engines.values() if engine.address})
 
     def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Mapping[str, Capacity]:
-        """The capacity of all engines, or of these, by their names, as each told it last; without those that have not told it yet.
+        """The capacity of all engines, or of these, by their names, as each reported it last; without those that have not reported it yet.
 
         ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
         """
@@ -87,7 +87,7 @@ class EngineSet:
         return {name: capacity for name, capacity in known.items() if capacity is not None}
 
     def unknown(self) -> Mapping[str, str]:
-        """Why it is not known what an engine has, by the names of those that have not told it yet."""
+        """Why it is not known what an engine has, by the names of those that have not reported it yet."""
         return {name: why for name, runner in self._runners.items() if (why := runner.unknown) is not None}
 
     def health(self) -> Mapping[str, Health]:

@@ -139,7 +139,7 @@ class DockerEngine:
             with answered():
                 listed = self._listed()
         except NotYet as error:
-            if not self._unreachable:  # said once, not at every look
+            if not self._unreachable:  # reported once, not at every look
                 log.warning("engine docker: %s", error)
             self._unreachable = True
             return [
@@ -212,7 +212,7 @@ class DockerEngine:
                     self._follow(container, handle, index)
         except BaseException as error:
             self._remove(gang.name)  # never half a gang
-            # 500: it has tried, and said why it can't; beyond that nobody has
+            # 500: it has tried, and reported why it can't; beyond that nobody has
             if isinstance(error, APIError) and (error.status_code or 500) <= 500:
                 why = f"CannotStartContainerError: Error response from daemon: {error.explanation}"
                 raise CannotStart(why) from error

@@ -48,7 +48,7 @@ class ContainerRequest:
 
         Args:
             entrypoint: The image's own.
-            default: Its ``CMD``, for a job that has no command. Docker takes it by itself only where it is told no entrypoint either.
+            default: Its ``CMD``, for a job that has no command. Docker takes it by itself only where no entrypoint is passed either.
             kernels: Directory for compiled kernels; None for an image without Muster, whose command runs without a supervisor.
         """
         contract = self.contract.to_env()

@@ -297,7 +297,7 @@ def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monk
     ):
         bench.engine.stop(handle, 0)
     [node] = status_of(bench.engine, handle)
-    assert "500" in node.words and "does not answer" in node.stale, "the last status, told as an old one"
+    assert "500" in node.words and "does not answer" in node.stale, "the last status, reported as an old one"
     monkeypatch.setattr(aws_batch, "_CAPACITY_AGE", 0.0)
     with pytest.raises(NotYet, match="AWS Batch does not tell its capacity"):
         bench.engine.capacity()

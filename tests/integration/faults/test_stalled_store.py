@@ -200,7 +200,7 @@ def test_a_download_whose_file_stalls_is_cut_off_and_keeps_nobody_waiting(server
     wait_for(lambda: not is_open(exports / "policy.bin"), 20, "that the file is closed")
 
 
-def test_pages_that_wait_for_the_store_say_so_and_the_others_stay_live(server: Server) -> None:
+def test_pages_that_wait_for_the_store_report_it_and_the_others_stay_live(server: Server) -> None:
     with Client(server.url) as client, ThreadPoolExecutor(40) as threads:
         job = submit_gang(client, CHATTING, env={"MUSTER_RUN": "running"})
         await_status(client, job, "RUNNING")

@@ -86,7 +86,7 @@ class Bench(ABC):
         return handle
 
     def ready(self, gang: Gang) -> Handle:
-        """Launch the gang, if that was not done, and wait until every node has said ``ready``; returns the handle."""
+        """Launch the gang, if that was not done, and wait until every node has printed ``ready``; returns the handle."""
         handle = self.launch(gang)
 
         def output() -> bool:

@@ -142,7 +142,7 @@ def test_leftovers_of_a_killed_upload_go_and_other_controllers_texts_stay(texts:
     assert kept(store) == [DIGEST] and (store.texts / "there" / DIGEST).exists()
 
 
-def test_what_is_no_text_and_what_is_too_long_is_refused(texts: KeptTexts, store: Store) -> None:
+def test_what_is_not_a_text_and_what_is_too_long_is_refused(texts: KeptTexts, store: Store) -> None:
     assert refusal(texts.keep, b"\xff\xfe", "key a", error=TextRefused) == "it is not a text (UTF-8)"
     too_long = refusal(texts.keep, b"x" * (LARGEST + 1), "key a", error=TextRefused)
     assert too_long == "the text has 1,048,577 bytes, and may have 1,048,576; shorten it"

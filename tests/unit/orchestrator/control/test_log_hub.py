@@ -182,7 +182,7 @@ def test_followers_end_with_the_job_and_have_its_last_line_though_its_push_was_l
     assert not world.hub._followed, "nothing is kept for nobody"
 
 
-def test_followers_end_though_no_commit_told_of_the_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_followers_end_though_no_commit_reported_the_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_hub, "_ROWS", 0.0)
     pieces = world.follow()
     world.settle()
@@ -234,7 +234,7 @@ def test_while_the_store_is_away_lines_come_from_memory_and_nothing_is_lost(worl
     wait_for(lambda: has(pieces, "before", "pushed meanwhile", "lost meanwhile"))
 
 
-def test_a_log_that_can_not_be_read_ends_its_stream_with_the_reason(
+def test_a_log_that_can_t_be_read_ends_its_stream_with_the_reason(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> list[int]:

@@ -23,7 +23,7 @@ LOG = (1, 0)
 
 
 class Followed:
-    """A job of one node that somebody follows: its log, the messages of its node, and one reader."""
+    """A job of one node that is followed: its log, the messages of its node, and one reader."""
 
     def __init__(self, directory: Path, limit: int = 1 << 30) -> None:
         self.run = Run(directory)

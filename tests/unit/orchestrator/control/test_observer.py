@@ -95,7 +95,7 @@ def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_witho
     gang = Gang()
     gang.look(ABSENT, ABSENT)
     body, future = gang.pool.calls.pop()
-    found = body()  # by now it has read that there is none
+    found = body()  # by now it has found none
     gang.write(0, 0)
     future.set_result(found)
     running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]

@@ -95,7 +95,7 @@ def test_only_a_fresh_answer_counts() -> None:
     assert silence is not None and not silence.is_lost
 
 
-def test_where_gangs_that_are_launched_meanwhile_are_not_heard_either_the_router_s_own_voice_proves_nothing() -> None:
+def test_where_gangs_that_are_launched_meanwhile_are_silent_too_the_router_s_own_voice_proves_nothing() -> None:
     cluster = Cluster(1)
     cluster.presence.expect("pulls its image", 1, 1)
     cluster.silence(0)
@@ -138,7 +138,7 @@ def test_a_router_that_removes_the_nodes_of_a_cut_network_one_by_one_ends_none()
     assert cluster.lost() == [index for index in range(60) if index != 7]
 
 
-def test_what_a_silent_node_sent_before_is_no_sign_of_the_others() -> None:
+def test_what_a_silent_node_sent_before_says_nothing_of_the_others() -> None:
     cluster = Cluster(2)
     cluster.silence(0)
     for _ in range(3 * int(L)):

@@ -12,7 +12,7 @@ from tests.support.orchestrator.retention import World
 from tests.support.permissions import permissions_count
 
 
-def test_a_store_that_is_away_is_no_store_without_runs(world: World) -> None:
+def test_a_store_that_is_away_is_not_taken_for_an_empty_one(world: World) -> None:
     world.ended("old")
 
     def absent() -> None:

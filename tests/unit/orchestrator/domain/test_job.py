@@ -152,7 +152,7 @@ def test_the_ends_of_nodes_are_judged(
 
 
 REQUESTED = [
-    # what was told to end is the cause only where nothing else is, in any order of reading, and whatever the clocks say
+    # what was asked to end is the cause only where nothing else is, in any order of reading, and whatever the clocks say
     ((RUNS, (143, 1.0, True)), "node 1: exit 143", False),
     ((RUNS, (143, 1.0, True), (137, 2.0)), "node 2: exit 137", True),
     ((RUNS, (137, 2.0), (143, 1.0, True)), "node 1: exit 137", True),
@@ -219,7 +219,7 @@ EXIT, RETRY = {"action": "EXIT"}, {"action": "retry"}
 
 # conditions, exit code → whether the attempt is tried again; its reason is "OutOfMemory: killed", its status reason "Host lost"
 CONDITIONS = {
-    "nothing said": ([], 1, True),
+    "no condition": ([], 1, True),
     "nothing matches": ([{**EXIT, "onExitCode": "2"}], 1, True),
     "the code matches": ([{**EXIT, "onExitCode": "1"}], 1, False),
     "a part of the code does not": ([{**EXIT, "onExitCode": "1"}], 12, True),

@@ -73,7 +73,7 @@ WRONG_TAGS = {
     "muster:account| |slurm|queue": " is empty; it is an account",
     "muster:images|refused|local": " is 'refused'; did you mean refuse?",
 }
-"""Tag, value and engine, of a queue or of a compute environment: what is said of it."""
+"""Tag, value and engine, of a queue or of a compute environment: the message about it."""
 
 
 @pytest.mark.parametrize("case", WRONG_TAGS)

@@ -43,7 +43,7 @@ def test_a_first_start_that_is_interrupted_leaves_nothing_half_made(tmp_path: Pa
 
 
 class Crowd:
-    """Callers that all wait while somebody else writes, then are carried out together."""
+    """Callers that all wait while another one writes, then are carried out together."""
 
     def __init__(self, home: Path) -> None:
         nothing: Any = None  # additions ask neither the disk nor the loop

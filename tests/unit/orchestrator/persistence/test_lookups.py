@@ -52,7 +52,7 @@ LOOKS: dict[str, Callable[[Session], object]] = {
     "by name, of an owner": lambda session: find_job(session, "ant", None, "ann"),
     "by name, of an owner without one": lambda session: find_job(session, "ant", None, "eve"),
     "by the name of an array": lambda session: find_job(session, "array"),
-    "by a name that there is not": lambda session: find_job(session, "a name that is not there"),
+    "by an unknown name": lambda session: find_job(session, "a name that is not there"),
     "by the beginning of an id": lambda session: find_job(session, "bbbb"),
     "by the beginning of an id in one queue": lambda session: find_job(session, "bbbb", ["other"]),
     "a child": lambda session: find_job(session, "array:12"),

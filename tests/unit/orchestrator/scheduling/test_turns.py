@@ -16,7 +16,7 @@ DEFAULT = queue()
 
 @dataclass
 class Cluster:
-    """One host, on which a gang runs for as many passes as it is said to."""
+    """One host, on which a gang runs for as many passes as it is set to."""
 
     cpus: float
     queues: dict[str, Queue] = field(default_factory=lambda: {"default": DEFAULT})
@@ -101,7 +101,7 @@ def test_a_queue_of_greater_priority_takes_no_turns_with_lower_ones() -> None:
 
 
 def test_a_large_gang_keeps_its_place_while_small_jobs_of_its_owner_and_of_others_pass() -> None:
-    """Else each small job that passes would give the reservation to somebody else's head."""
+    """Else each small job that passes would give the reservation to another owner's head."""
     cluster = Cluster(cpus=4)
     cluster.submit("long", owner="c", cpus=1)
     cluster.tick(1, length=50)

@@ -39,7 +39,7 @@ WRONG = {
     "Ant rsl_rl algorithm: {class_name: Distillation}": "teacher_checkpoint: name the run that trained the teacher",
     "Ant rsl_rl teacher_checkpoint: taught@3": "teacher_checkpoint: PPO has no teacher; leave it out",
 }
-"""Task, algorithm and settings: what is said of them."""
+"""Task, algorithm and settings: the message about them."""
 
 
 def job(path: Path, task: str, algorithm: str, settings: str) -> str:

@@ -1,4 +1,4 @@
-"""The job YAML: what is wrong with it is told in one line, with file, line and key; what is right compiles."""
+"""The job YAML: what is wrong with it is reported in one line, with file, line and key; what is right compiles."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def ppo(text: str) -> str:
 
 
 def problem(tmp_path: Path, text: str | bytes, *assignments: str) -> str:
-    """What is said of a file, without the directory that it lies in."""
+    """The message about a file, without the directory that it lies in."""
     path = tmp_path / "job.yaml"
     path.write_bytes(text if isinstance(text, bytes) else text.encode())
     message = refusal(load, str(path), list(assignments), error=SpecError)
@@ -82,7 +82,7 @@ LINES = {
         "environment: 'a=b' can't be set: a name has no '=', and neither name nor value a zero byte"
     ),
 }
-"""Of a third line: what is said of it."""
+"""Of a third line: the message about it."""
 PPO = {
     "learning_rat: 1.0": "learning_rat: unknown key; did you mean learning_rate?",
     "schedule: adaptiv": "schedule: expected 'adaptive' or 'fixed', found 'adaptiv'",
@@ -171,7 +171,7 @@ def test_text_that_is_not_yaml_is_reported_with_its_line(tmp_path: Path, text: s
     assert problem(tmp_path, text).startswith(f"job.yaml{NOT_YAML[text]}")
 
 
-def test_a_file_that_can_not_be_read_is_named(tmp_path: Path) -> None:
+def test_a_file_that_can_t_be_read_is_named(tmp_path: Path) -> None:
     for path, output in ((tmp_path / "none.yaml", "No such file or directory"), (tmp_path, "Is a directory")):
         assert refusal(load, str(path), error=SpecError) == f"{path}: {output}"
 

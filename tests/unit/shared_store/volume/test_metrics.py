@@ -52,7 +52,7 @@ def test_a_last_line_that_a_crash_cut_short_is_passed_over(run: Run, torn: bytes
     assert history(run) == [(1, 1), (2, 1)]
 
 
-def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(run: Run) -> None:
+def test_lines_that_are_not_records_and_files_that_are_not_ours_are_passed_over(run: Run) -> None:
     attempt(run, 1, 0, 1)
     with open(run.metrics / "metrics-e1.jsonl", "ab") as file:
         file.write(b'[]\nnot json\n{"note": 1}\n\n{"iteration": 2, "epoch": 1}\n')
