@@ -82,6 +82,18 @@ def job(tmp_path: Path) -> Followed:
     return Followed(tmp_path / "run")
 
 
+def test_a_push_that_comes_before_another_waits_for_it_and_doubles_change_nothing(job: Followed) -> None:
+    for text in "abc":
+        job.write(text, push=False)
+    double = job.late[1]
+    job.deliver(2)
+    job.deliver(1)
+    assert job.read() == [] and not job.logs.delivers()
+    job.deliver(0)
+    job.logs.push(LOG, *double)
+    assert job.read(memory_alone=True) == ["a", "b", "c"]
+
+
 def test_a_log_that_was_truncated_is_read_from_its_new_beginning(job: Followed) -> None:
     job.write("one", "two")
     job.read()

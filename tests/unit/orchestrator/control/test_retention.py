@@ -24,6 +24,7 @@ from orchestrator.persistence.batch_models import (
     Attempt,
     Dependency,
     JobDefinition,
+    JobQueue,
     Node,
     RunRecord,
     now,
@@ -248,6 +249,44 @@ def test_a_controller_that_ends_amid_a_step_leaves_the_rows_to_the_next_one(
 
 
 # -- rules, owners, definitions -----------------------------------------------------------------------------------------
+
+
+def test_rules_of_queues_and_of_the_controller(world: World) -> None:
+    day = now() - A_DAY
+    for queue, tags in (
+        ("short", {"muster:retention": "2h"}),
+        ("kept", {"muster:retention": "off"}),
+        ("bad", {"muster:retention": "x"}),
+    ):
+        world.add(JobQueue(name=queue, compute_environments=["local"], tags=tags))
+    # with a queue that was deleted its rule went, which may have been to keep its jobs
+    for queue in ("default", "short", "kept", "bad", "deleted"):
+        world.ended(queue, queue=queue, stopped_at=day, from_yaml=True)
+    assert world.retention(default=inf).take_all().jobs == 1 and world.jobs() == ["bad", "default", "deleted", "kept"]
+    assert world.retention(default=2 * 86_400).take_all().jobs == 0
+    looks, _ = world.step(take=True, default=A_DAY // 2)
+    assert [each["jobs"] for each in looks] == [["default"]]
+    world.ended("default", stopped_at=day, from_yaml=True)
+    assert world.retention(default=3600).take_all().jobs == 1 and world.jobs() == ["bad", "deleted", "kept"]
+    world.add(JobQueue(name="deleted", compute_environments=["local"], tags={"muster:retention": "1m"}))
+    assert world.retention().take_all().jobs == 1 and world.jobs() == ["bad", "kept"], "created again, with a rule"
+
+
+def test_a_switch_turns_it_off(world: World) -> None:
+    world.ended("old")
+    calls: list[Callable[[], object]] = []
+    off, on = world.retention(default=inf), world.retention()
+    for each in (off, on):
+        each._next = 0.0
+        each.when_due(calls.append)
+        each.when_due(calls.append)
+    assert len(calls) == 2, "one pass of each at a time"
+    calls[0]()
+    assert world.jobs() == ["old"]
+    calls[1]()
+    assert world.jobs() == []
+    on.when_due(calls.append)
+    assert len(calls) == 2, "the next pass comes later"
 
 
 def test_in_the_first_days_after_an_upgrade_it_only_logs(world: World, caplog: pytest.LogCaptureFixture) -> None:

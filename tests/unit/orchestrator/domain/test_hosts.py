@@ -46,6 +46,13 @@ amounts = st.builds(Resources, st.integers(0, 640).map(lambda n: n / 8), st.inte
 """CPUs in eighths, which floats hold exactly."""
 
 
+def test_amounts_are_added_and_subtracted_kind_by_kind() -> None:
+    some, more = Resources(1.5, 2, 512), Resources(0.25, 1, 100)
+    assert some + more == Resources(1.75, 3, 612)
+    assert some - more == Resources(1.25, 1, 412)
+    assert more - some == Resources(-1.25, -1, -412)
+
+
 @pytest.mark.parametrize(
     ("requested", "free", "fits"),
     [

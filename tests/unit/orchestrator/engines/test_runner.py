@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from orchestrator.engines import runner as runner_module
-from orchestrator.engines.api import Gang, Handle, NodePhase, NotYet, Plan, Transient
+from orchestrator.engines.api import Gang, Handle, NodePhase, NotYet, Plan, Traits, Transient
 from orchestrator.engines.runner import Runner
 from orchestrator.engines.testing.fake import FakeEngine
 from orchestrator.engines.testing.rigs import make_gang
@@ -76,6 +76,47 @@ def test_a_launch_that_is_refused_again_and_again_keeps_no_trace_of_each_try(run
     for _ in range(20):
         assert refusal() is first
     assert len(list(traceback.walk_tb(first.__traceback__))) == depth
+
+
+class StuckEngine(FakeEngine):
+    """Its launches hang, and nothing else does."""
+
+    traits = Traits(launches=2)
+
+    def launch(self, plan: Plan[Gang]) -> Handle:
+        self.answers.wait()
+        return super().launch(plan)
+
+    def _called(self) -> None:
+        """All other calls are answered."""
+
+
+@pytest.mark.parametrize("engine", [StuckEngine()])
+def test_launches_that_hang_are_named_and_hold_up_no_look(
+    engine: FakeEngine, runner: Runner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runner_module, "OVERDUE", 0.1)
+    engine.answers.clear()
+    gangs = [make_gang(f"job-{number}", "/store", 1, "fake/host", ["true"]) for number in range(3)]
+
+    def words() -> list[str]:
+        found = []
+        for gang in gangs:
+            try:
+                runner.launch(gang.name, lambda gang=gang: runner.plan(gang))  # type: ignore[misc]
+            except NotYet as wait:
+                found.append(str(wait))
+        return found
+
+    output = wait_for(lambda: all(found := words()) and found, 10, "that launches hang")
+    assert len(output) == 3 and all(
+        each.startswith("the fake engine has not answered a launch since ") for each in output
+    )
+    assert runner.health.problem == output[0] and runner.silence is None
+    assert runner.capacity(10.0) is not None
+    engine.answers.set()
+    wait_for(lambda: not words(), 10, "that all are launched")
+    assert runner.health.problem is None
 
 
 def test_a_launch_whose_handle_could_not_be_recorded_is_not_asked_for_again(engine: FakeEngine, runner: Runner) -> None:

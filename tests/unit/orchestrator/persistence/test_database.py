@@ -239,3 +239,10 @@ def test_an_array_is_asked_to_end_by_the_request_that_asked_its_children(
         for reason in (request, "again"):
             ask_to_end(session, or_(Job.id == "a", Job.parent == "a"), reason, cancel=request == "c")
     assert stops(session) == [array, *ends]
+
+
+def test_a_child_that_is_ended_alone_leaves_its_array_alone(session: Session) -> None:
+    session.add_all([job("a", kind="array", status="PENDING"), job("a:0", parent="a"), job("a:1", parent="a")])
+    session.commit()
+    ask_to_end(session, Job.id == "a:1", "c", cancel=True)
+    assert stops(session) == [_LEFT, _LEFT, _CANCELLED]

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from shared_store.volume import epoch as module
 from shared_store.volume.epoch import (
     LARGEST_EPOCH,
     Claim,
@@ -152,6 +153,21 @@ def test_a_node_starts_on_the_volume_on_which_its_epoch_is_published(run: Run) -
     with pytest.raises(StoreError, match="is not the controller's: run run has epoch 5 there, not 6") as caught:
         find_epoch(run, 6, patience=0)
     assert str(caught.value).startswith(f"store {run.path.parent.parent} on ")
+
+
+def test_a_node_looks_again_at_the_directories_until_its_epoch_is_there(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    listed: list[Path] = []
+
+    def sleep(seconds: float) -> None:
+        assert 0 < seconds < 1
+        raise_epoch(run, 7)
+
+    monkeypatch.setattr(module.time, "sleep", sleep)
+    monkeypatch.setattr(module.os, "listdir", lambda path: listed.append(path) or [])
+    find_epoch(run, 7)
+    assert listed[:2] == [run.path.parent, run.path]
 
 
 def test_a_number_is_durable_before_it_is_used(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

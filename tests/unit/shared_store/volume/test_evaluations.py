@@ -111,3 +111,22 @@ def test_one_line_tells_the_successes_of_a_task_that_declares_them_and_else_how_
     assert evaluations.in_one_line({**found, **laps}) == (
         "62 of 64 episodes succeeded (96.9 %: lap_complete ended the episode), progress 98.1 %, mean length 9.0 steps, mean return 96.50"
     )
+
+
+def test_a_summary_is_printed_with_what_any_job_may_have_left_out_of_it() -> None:
+    few = {**FIGURES, "checkpoint": "00000003-e1", "episodes": 3, "success": 7, "causes": {"fall": 2}}
+    result = "\n".join(evaluations.lines(few))
+    assert "3 episodes of Cartpole, checkpoint 00000003-e1" in result and "success" not in result
+    config = {"randomize": {"friction": [0.4, 0.6]}, "curriculum": {}}
+    share = {"share": 0.94, "low": 0.875, "high": 0.972}
+    whole = {**few, "episodes": 100, "config": config, "success": share, "success_is": "it stands"}
+    result = "\n".join(evaluations.lines({**FIGURES, **whole}))
+    assert "with config.randomize.friction: [0.4, 0.6]" in result and "config.curriculum: {}" in result
+    assert " ".join(result.split()).count("success 94.0 % 87.5 % to 97.2 % it stands") == 1
+    term = {"mean": 1.0, "low": 0.5, "high": 1.5, "std": 0.1}
+    rows = list(
+        evaluations.lines({**FIGURES, **whole, "rewards": {"track_angular_velocity": term}, "metrics": {"way": term}})
+    )
+    heading = next(row for row in rows if row.endswith("std"))
+    columns = {len(row) for row in rows if row.startswith(("reward", "metric", "return"))}
+    assert columns == {len(heading)}, "they stand"

@@ -143,6 +143,19 @@ def test_a_full_volume_takes_whole_lines_only_and_the_log_goes_on_when_there_is_
     assert path.read_bytes() == lines_of(0, 200) + lines_of(400, 200)
 
 
+def test_half_a_line_that_a_full_volume_took_is_taken_back(small: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LogWriter, "_check_room", lambda *_: None)  # as where a quota ends, which no volume tells
+    path = small.log("job", 1, 0)
+    writer = LogWriter(path, 64 << 20)
+    writer.append(lines_of(0, 20))
+    filler = fill(small)
+    os.truncate(filler, filler.stat().st_size - 8192)
+    data = lines_of(20, 200)
+    written = writer.append(data)
+    assert 4000 < written < len(data) and data[:written].endswith(b"\n") and writer.error is not None
+    assert path.read_bytes() == lines_of(0, 20) + data[:written]
+
+
 def test_no_log_fills_a_volume_and_on_a_full_one_its_end_is_still_kept(small: Run) -> None:
     writer = LogWriter(small.log("job", 1, 0), 1 << 30)
     volume = os.statvfs(small.path)
@@ -163,6 +176,18 @@ def test_lines_of_a_node_keep_their_order_when_its_clock_is_set_back(run: Run) -
     merged = list(LogView.of(run, "job").drain())
     assert [line.text for line in merged] == ["a0", "a1", "a2", "a3", "b", "a4"]
     assert merged[2].time == timestamp(START - 86_400), "the time that the node wrote is shown"
+
+
+def test_logs_of_different_length_are_merged_by_time_from_beginning_to_end(run: Run) -> None:
+    sizes = {0: 3000, 1: 50, 2: 400}
+    for node, size in sizes.items():
+        lines = [format_line(START + i + node / 10, node, "o", "z" * size) for i in range(1200)]
+        LogWriter(run.log("job", 1, node)).append("".join(lines).encode())
+    LogWriter(run.log("job", 2, 0)).append(format_line(START, 0, "o", "second attempt").encode())
+    lines = list(LogView.of(run, "job").drain())
+    assert len(lines) == 3601
+    keys = [(line.attempt, line.time) for line in lines]
+    assert keys == sorted(keys)
 
 
 @pytest.mark.parametrize("how", ["truncated", "replaced by a shorter one", "replaced by a longer one"])
@@ -203,6 +228,14 @@ def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: R
     assert all(event.end == after.offset for event, after in pairwise(seen))
     for event in random.Random(1).sample(seen, 50):
         assert next(late.forward(start=event.offset)) == event
+
+
+def test_a_view_survives_the_deletion_of_files_that_it_knows(run: Run) -> None:
+    path = run.log("job", 1, 0)
+    writer = written(path, 2400)
+    view = LogFile(path, "stream").look()
+    more(writer, 2400, 8000)
+    assert numbers([event.text for event in view.forward()])[:700] == list(range(700))
 
 
 def test_counting_the_lines_of_a_log_takes_no_memory_of_its_size(tmp_path: Path) -> None:

@@ -73,6 +73,15 @@ def test_the_tenth_attempt_comes_after_the_second_and_foreign_lines_hide_no_othe
     assert texts(LogView.of(run, "job").poll()) == ["a", "b\N{REPLACEMENT CHARACTER}", "c", "2", "9", "10"]
 
 
+def test_other_jobs_and_other_files_are_not_read(run: Run) -> None:
+    assert LogView.of(run, "job").poll() == LogView.of(run, "job", attempt=3).poll() == []
+    append(run, line(1, "ours"))
+    append(run, line(1, "theirs"), job="other")
+    (run.logs("job", 1) / "node-0.log.gz").write_text(line(1, "no"))
+    (run.path / "logs" / "job" / "notes").mkdir()
+    assert texts(LogView.of(run, "job").poll()) == ["ours"]
+
+
 def test_node_rank_and_attempt_select(run: Run) -> None:
     append(run, line(1, "0/0", 0) + line(2, "0/1", 1) + line(3, "supervisor", None))
     append(run, line(1, "1/2", 2), node=1)
@@ -169,6 +178,19 @@ def test_going_back_window_by_window_gives_every_line_once_in_its_order(
     assert seen(found) == seen(list(LogView.of(kept, JOB, **which).drain()))
 
 
+@pytest.mark.parametrize("most", [7, 250])
+def test_going_on_from_any_window_gives_what_follows_it(kept: Run, most: int) -> None:
+    chosen = Chosen(kept, JOB)
+    everything = seen(list(LogView.of(kept, JOB).drain()))
+    window = lines_before(chosen, lines_before(chosen, chosen.end(), 300).first, most)
+    begin = everything.index(seen(window.lines)[0])
+    assert seen(window.lines) == everything[begin : begin + most]
+    after = lines_after(chosen, window.last, most)
+    assert seen(after.lines) == everything[begin + most : begin + 2 * most] and after.more
+    rest = lines_after(chosen, after.last, 10_000)
+    assert seen(rest.lines) == everything[begin + 2 * most :] and not rest.more
+
+
 def test_a_window_of_long_logs_reads_little_of_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, nodes, read = Run(tmp_path / "run"), 8, list[int]()
     for node in range(nodes):
@@ -211,6 +233,14 @@ def test_a_window_says_where_lines_were_deleted_and_goes_on_before_them(tmp_path
     assert len(missing) == 1 and found[0].text.startswith("0 ") and found[-1].text.startswith("1499 ")
     numbers = [int(line.text.split()[0]) for line in found if line.rank == 0]
     assert numbers == sorted(numbers) and len(numbers) == len(found) - 1
+
+
+def test_a_line_that_is_longer_than_a_piece_is_in_a_window_like_any_other(tmp_path: Path) -> None:
+    run = Run(tmp_path)
+    chosen = Chosen(run, JOB)
+    assert chosen.end() == {} and lines_before(chosen, {}).lines == [] and search(chosen, "x", {}).is_over
+    write(run, 1, 0, [(1, 0, "a"), (2, 0, "b" * 200_000), (3, 0, "c")])
+    assert [line.text[0] for line in lines_before(chosen, chosen.end()).lines] == ["a", "b", "c"]
 
 
 def test_a_search_finds_every_line_with_the_text_and_goes_on_after_the_last_one(kept: Run) -> None:

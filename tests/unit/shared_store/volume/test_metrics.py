@@ -44,6 +44,13 @@ def test_a_written_record_is_read_at_once(run: Run) -> None:
     assert len(read_metrics(run)) == 1
 
 
+def test_the_tenth_attempt_follows_the_ninth(run: Run) -> None:
+    attempt(run, 9, 0, 4)
+    attempt(run, 10, 2, 6)
+    assert history(run) == [(1, 9), (2, 9), (3, 10), (4, 10), (5, 10), (6, 10)]
+    assert [record["iteration"] for record in read_metrics(run, after=2)] == [3, 4, 5, 6]
+
+
 @pytest.mark.parametrize("torn", [b"{", b'{"iteration": 3, "epoch"', b'{"iteration": 3, "epoch": 1}', b"\0\0\0\0"])
 def test_a_last_line_that_a_crash_cut_short_is_passed_over(run: Run, torn: bytes) -> None:
     attempt(run, 1, 0, 2)

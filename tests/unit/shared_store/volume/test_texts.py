@@ -75,10 +75,23 @@ def test_a_missing_or_altered_text_is_refused_with_its_place_and_the_remedy(tmp_
     assert refusal(texts.read, tmp_path, REFERENCE, error=TextError) == f"{begins}not a regular file{ends}"
 
 
+def test_either_of_two_places_gives_the_text(tmp_path: Path) -> None:
+    texts.keep(tmp_path / "store", LONG["text"].encode())
+    assert texts.read_either(tmp_path / "run", tmp_path / "store", REFERENCE) == LONG["text"]
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / DIGEST).write_text("altered")
+    assert texts.read_either(tmp_path / "run", tmp_path / "store", REFERENCE) == LONG["text"]
+
+
 def test_the_limit_counts_bytes_of_the_definition() -> None:
     quoted = {"file": "q.py", "text": '"' * (IN_DEFINITION // 4)}  # each is \\\" there
     assert beside(spec(quoted))[1]
     assert not beside(spec({"file": "q.py", "text": "x" * (IN_DEFINITION // 4)}))[1]
+
+
+def test_a_text_with_half_of_a_character_is_left_to_those_who_refuse_it() -> None:
+    half = spec({"file": "h.py", "text": "\ud83d" + "x" * IN_DEFINITION})
+    assert beside(half) == (half, {})
 
 
 def test_another_file_replaces_a_file_whole_in_whichever_form() -> None:
