@@ -121,13 +121,13 @@ def _repository(image: str) -> str:
 
 
 def _image(gang: Gang, index: int) -> str:
-    return str(gang.containers[index].get("image") or "") if gang.containers else ""
+    return str(gang.nodes[index].container.get("image") or "")
 
 
 def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> dict[str, Any]:
     """``containerProperties`` of a node: the job's own, with what Muster needs."""
     index = node.contract.node_index
-    own = dict(gang.containers[index]) if gang.containers else {}
+    own = dict(gang.nodes[index].container)
     placement = node.placement
     resources = [
         {"type": "VCPU", "value": str(max(1, math.ceil(placement.cpus)))},

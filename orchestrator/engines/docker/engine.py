@@ -193,9 +193,9 @@ class DockerEngine:
         gang = plan.gang
         images = [self._image(request.image) for request in plan.request]
         existing = self._containers(gang.name)
-        for index, (image, command) in enumerate(zip(images, gang.commands, strict=True)):
+        for index, (image, node) in enumerate(zip(images, gang.nodes, strict=True)):
             if index not in existing:
-                _check_image(plan.request[index].image, image, command)
+                _check_image(plan.request[index].image, image, node.command)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
         requests = [r.at(addresses[index], addresses[gang.main]) for index, r in enumerate(plan.request)]

@@ -79,7 +79,7 @@ class ContainerRequest:
 def container_request(gang: Gang, node: NodePlan, cores: float) -> ContainerRequest:
     """The request for one node of ``gang``; ``cores``: of the machine."""
     index = node.contract.node_index
-    container = gang.containers[index]
+    container = gang.nodes[index].container
     return ContainerRequest(
         image=str(container.get("image") or ""),
         name=f"muster-{gang.name.replace('/', '-')}-{index}",

@@ -297,8 +297,7 @@ class RayEngine:
 
 def _request(gang: Gang, node: NodePlan, machines: Mapping[str, Mapping[str, Any]]) -> NodeRequest:
     """A node's part of the request to the driver; ``machines``: those of the cluster, by host name. Raises EngineError."""
-    index, placement = node.contract.node_index, node.placement
-    container = gang.containers[index] if gang.containers else {}
+    placement, container = node.placement, gang.nodes[node.contract.node_index].container
     return NodeRequest(
         contract=node.contract,
         command=list(node.command),
