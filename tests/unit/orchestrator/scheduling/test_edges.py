@@ -4,11 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from orchestrator.scheduling.fit import Fit, fit
+from orchestrator.scheduling.free_resources import Allocation
+from orchestrator.scheduling.order import decayed, score, share_score, weight
 from orchestrator.scheduling.placement import (
+    affordable,
+    amounts,
+    count_of,
+    less,
+    limit_of,
+    needs,
     never_fits,
     place,
     together,
 )
+from orchestrator.scheduling.quota import Quota, quota_of
+from orchestrator.scheduling.reservation import end_of
 from orchestrator.scheduling.snapshot import FairShare, TimeLimit
 from tests.support.orchestrator.scheduling import (
     CAPACITY,
@@ -63,6 +74,89 @@ def test_long_jobs_together_leave_the_head_the_cpus_of_its_compute_environment()
     held = [running("cart", on("a", 4), environment="p", timeout=700)]
     waiting = line(job("head", 6, queue="p"), *[job(f"j{i}", queue="p") for i in range(3)], job("k", 5, queue="q"))
     assert Pass([host(cpus=64)], waiting, held, queues, environments).started == "j0:a j1:a k:a"
+
+
+def test_an_idle_queue_s_answer_has_a_place_or_a_problem() -> None:
+    both = {"a - b": environment("a - b", max_cpus=2)}
+    requested = queue(environments=("a - b",))
+    placed = fit(gang(node(2)), requested, both, [host()])
+    assert placed == Fit(Allocation("a - b", (on("a", 2, memory=100),)), None)
+    assert fit(gang(node(3)), requested, both, [host()]) == Fit(
+        None, "compute environment a - b has at most 2 CPUs; needs 1 node with 3 CPUs, 0 GPUs, 100 MiB in all"
+    )
+
+
+def test_the_use_of_a_share_is_weighted_by_its_name_or_its_longest_prefix() -> None:
+    policy = FairShare(600, 0, {"a": 0.5, "t*": 2.0, "te*": 3.0, "tea": 4.0, "*": 5.0})
+    weights = {"a": 0.5, "to": 2.0, "ten": 3.0, "tea": 4.0, "b": 5.0, "aa": 5.0}
+    assert {share: weight(policy, share) for share in weights} == weights
+    assert weight(FairShare(600, 0, {"x": 2.0, "yx": 2.0}), "xy") == 1.0
+    plain, fair = queue(), queue(policy=policy)
+    usage = {("default", "a"): 8.0, ("other", "b"): 9.0}
+    assert [score(each, "a", usage) for each in (plain, fair)] == [8.0, 4.0]
+    assert [score(each, "b", usage) for each in (plain, fair)] == [0.0, 0.0]
+    ordered = [job("x", 2, share="a"), job("y", 3, share="b"), job("z", share="a"), job("w", share="a")]
+    assert share_score(fair, ordered, ordered[2], usage) == 4.0 + 0.5 * 60 * 2
+    assert share_score(plain, ordered, ordered[3], usage) == 8.0 + 60 * 3
+    unnamed = [job("x", 2), job("y", share="a"), job("z")]
+    assert share_score(fair, unnamed, unnamed[2], {("default", ""): 1.0}) == 5.0 + 5 * 60 * 2
+    assert [decayed(8.0, age, half) for age, half in ((0, 9), (-9, 9), (9, 9), (600, 0), (1, 1))] == [8, 8, 4, 4, 4]
+
+
+def test_jobs_and_gangs_without_a_share_have_one_in_common() -> None:
+    found = quota_of(queue(policy=HALF), [job("x")], [running("y", share=None), running("z", share="")], {})
+    assert found is not None and found.active == 1
+    assert found.used_of("new", False) == found.used_of("new", True) == 0
+
+
+def test_a_quota_counts_active_shares_and_the_queue_s_own_gangs() -> None:
+    assert quota_of(queue(), [], [], {}) is None and quota_of(queue(policy=FairShare(600, 0, {})), [], [], {}) is None
+    held = [
+        running("x", on("a", 2, [0, 1]), on("b", 1), share="s"),
+        running("y", on("a", 3), environment="other"),
+        running("z", on("a", 4), queue="elsewhere", share="e"),
+    ]
+    usage = {("default", "u"): 1.0, ("default", "v"): 0.99, ("elsewhere", "w"): 9.0}
+    found = quota_of(queue(policy=FairShare(600, 1, {})), [job("w", share="s")], held, usage)
+    assert found == Quota(0.01**3, 3, {"all": [3.0, 2.0], "other": [3.0, 0.0]}), "s, none and u"
+    assert found.used_of("all", True) == 2 and found.used_of("all", False) == 3 and found.used_of("new", True) == 0
+    half, hosts = Quota(0.5, 1, {"all": [1.0, 1.0]}), [host("a", 4, 2), host("b", 6, 2)]
+    assert [half.limit(True, hosts, 3.0), half.limit(False, hosts, 3.0), half.limit(False, hosts, 99.0)] == [2, 1.5, 5]
+    assert half.left(gang(node(1, 1)), "all", hosts, 99.0) == 1 and half.left(gang(node(1)), "all", hosts, 99.0) == 4
+
+
+def test_amounts_are_worded_with_few_digits_and_never_below_zero() -> None:
+    assert (
+        amounts(node(1, 1, 1023)) == "1 CPU, 1 GPU, 1023 MiB" and amounts(node(0, 2, 1024)) == "0 CPUs, 2 GPUs, 1 GiB"
+    )
+    assert (
+        amounts(node(-1, 0, -5)) == "0 CPUs, 0 GPUs, 0 MiB"
+        and amounts(node(0.004, 0, 8182)) == "0 CPUs, 0 GPUs, 7.99 GiB"
+    )
+    assert [count_of(each, "CPU") for each in (2.5, 100, 1.004, 1.006)] == [
+        "2.5 CPUs",
+        "100 CPUs",
+        "1 CPU",
+        "1.01 CPUs",
+    ]
+    assert needs(gang(node(), node(), minimum=1)) == "needs at least 1 node with 1 CPU, 0 GPUs, 100 MiB in all"
+    assert limit_of([host()]) is None and limit_of([]) is None
+    assert limit_of([host(), replace(host("q", 8), queue=True)]) == "queue q gives a gang at most 8 CPUs, 0 GPUs, 8 GiB"
+
+
+def test_of_a_gang_as_many_nodes_are_affordable_as_fit_in_all() -> None:
+    shape = gang(node(1, 1), node(2), node(1, 1), minimum=2)
+    assert [affordable(shape, cpus) for cpus in (4, 3.999, 3, 3 - 1e-10, 2.9)] == [3, 2, 2, 2, 0]
+    assert [affordable(shape, gpus=gpus) for gpus in (2, 1, 0)] == [3, 2, 0] and affordable(shape) == 3
+    assert less(host("a", 4, 3, 100), [on("a", 1, [1], 30), on("a", 0.5, (), 10)]) == replace(
+        host("a", 2.5, 3, 60), gpus=("a0", "a2")
+    )
+
+
+def test_a_gang_ends_at_its_timeout_and_one_that_starts_counts_from_now() -> None:
+    assert end_of(5000, 1000, 9) == 10_000 and end_of(5000, None, 9) == 14_000 and end_of(5000, 1000, 2) == 5000
+    assert end_of(5000, 1000, None) == end_of(0, 0, 4_000_000_000) == float("inf")
+    assert end_of(0, 0, 3_999_999_999) == 3_999_999_999_000
 
 
 def test_what_is_reserved_on_other_hosts_is_nothing_to_a_queue() -> None:
