@@ -33,6 +33,8 @@ NOTHING = References()
 def test_an_old_run_that_holds_nothing_but_logs_goes_with_its_job() -> None:
     assert decide(RUN, [OLD], NOTHING) == Decision(True, ("old",))
     assert decide(None, [OLD], NOTHING) == Decision(False, ("old",)), "a job that never started"
+    waited = References.of([RetentionReference("job", "old", "job w waits for it")])
+    assert decide(None, [OLD], waited) == Decision(False, (), ("job w waits for it",))
 
 
 @pytest.mark.parametrize(
@@ -57,6 +59,15 @@ def test_nothing_of_a_run_goes_while_something_needs_it(
     assert (decision.run, decision.jobs) == (False, ())
     assert reason in " ".join(decision.reasons)
     assert list(decision.reasons) == still_needed(run, [OLD, *jobs], references)
+
+
+def test_a_plug_in_that_can_t_be_asked_keeps_every_run_and_every_job_for_one_reason() -> None:
+    unknown = References.of([], [], ["plug-in x is not installed"])
+    assert still_needed(RUN, [OLD, JobFacts("young")], unknown) == ["plug-in x is not installed"]
+    assert decide(None, [OLD, JobFacts("other", is_due=True)], unknown) == Decision(
+        False, (), ("plug-in x is not installed",)
+    )
+    assert (unknown | NOTHING).unknown == (NOTHING | unknown).unknown == unknown.unknown
 
 
 @pytest.mark.parametrize(

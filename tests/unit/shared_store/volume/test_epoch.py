@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from pathlib import Path
 
@@ -168,6 +169,15 @@ def test_a_node_looks_again_at_the_directories_until_its_epoch_is_there(
     monkeypatch.setattr(module.os, "listdir", lambda path: listed.append(path) or [])
     find_epoch(run, 7)
     assert listed[:2] == [run.path.parent, run.path]
+
+
+def test_the_last_64_claims_are_kept_and_other_files(run: Run) -> None:
+    for number in (1, 35, 36, 99):
+        (run.path / f"EPOCH.{number}").touch()
+    (run.path / "EPOCH.1.old").touch()
+    raise_epoch(run, 100)
+    kept = {"EPOCH", "EPOCH.1.old", "EPOCH.36", "EPOCH.99", "EPOCH.100"}
+    assert set(os.listdir(run.path)) == kept
 
 
 def test_a_number_is_durable_before_it_is_used(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
