@@ -6,7 +6,7 @@
 # make without-racer    the suite once without the racer's package; TESTS="tests/unit tests/integration" by default
 # make torture N=300   kill everything at random moments: every run must end with the same bits; then hostile jobs, full disks, clocks, outages
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
-# make mutants          small faults in the pure modules, and in a sample of PPO: which ones do the unit tests not notice?
+# make mutants          small faults in the pure modules: which ones do the unit tests not notice?
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
 # make coverage TESTS=tests/unit   the branches of control, engines and learning that these tests never enter
 # make fuzz N=10000    malformed requests and hostile clients; no answer may be a 500, and others must be served meanwhile
@@ -156,9 +156,11 @@ bits: $(READY)
 fuzz: $(READY)
 	MUSTER_FUZZ=$(or $(N),10000) $(BIN)/pytest -q tests/integration/conformance/test_fuzz.py tests/integration/conformance/test_hostile_clients.py
 
-# MODULES="domain/job epoch" narrows it, SEED=2 takes other samples of PPO, WHICH=survivors tries only what survived the last time, WHICH=rest goes on
+# MODULES="orchestrator.domain.job*" narrows it
 mutants: $(READY)
-	$(BIN)/python -m tests.support.mutation.run $(MODULES) --seed $(or $(SEED),1) --which $(or $(WHICH),all)
+	$(BIN)/pip install -q -c constraints.txt mutmut==3.8.1
+	$(BIN)/mutmut run $(MODULES)
+	$(BIN)/mutmut results
 
 env: $(READY)
 

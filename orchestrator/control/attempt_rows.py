@@ -64,12 +64,12 @@ def state_of(job: Job, attempt: Attempt) -> AttemptState:
     )
 
 
-def notes_of(job: Job, attempt: Attempt) -> list[str]:
+def note_of(job: Job, attempt: Attempt) -> str:
     """For the beginning of the nodes' logs: that others have cancelled the attempt before this one."""
     before = next((each for each in job.attempts if each.number == attempt.number - 1), None)
     if before is None or before.ending != Ending.CANCELLED:
-        return []
-    return [f"muster: attempt {before.number} was {before.status_reason}"] * len(attempt.nodes)
+        return ""
+    return f"muster: attempt {before.number} was {before.status_reason}"
 
 
 class SharedRows:

@@ -16,7 +16,7 @@ from typing import Any
 from sqlalchemy.orm import Session
 
 from orchestrator import machine
-from orchestrator.control.attempt_rows import GRACE, NO_EPOCH, SharedRows, notes_of, state_of
+from orchestrator.control.attempt_rows import GRACE, NO_EPOCH, SharedRows, note_of, state_of
 from orchestrator.control.bus import Bus
 from orchestrator.control.clock import Clock
 from orchestrator.control.kept_texts import KeptTexts, references_of
@@ -31,7 +31,7 @@ from orchestrator.domain.attempt import FINISHING, AttemptPhase, AttemptState, a
 from orchestrator.domain.attempt_events import Delayed, Due, Event, Gone, Launched, Preempted, Prepared, StartRefused
 from orchestrator.domain.gang import GangSpec
 from orchestrator.domain.job import Ending, Status
-from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangStatus, NotYet, Plan
+from orchestrator.engines.api import CannotStart, Cause, EngineError, Gang, GangNode, GangStatus, NotYet, Plan
 from orchestrator.engines.registry import EngineSet
 from orchestrator.persistence.batch_models import Attempt, Job, now
 from orchestrator.persistence.log_groups import record_logs
@@ -281,7 +281,8 @@ class Attempts:
 
     def gang(self, job: Job, attempt: Attempt, spec: GangSpec, options: Mapping[str, str]) -> Gang:
         """The gang that the engine starts for an attempt; ``options``: those of its compute environment and queue."""
-        nodes, own = spec.nodes[: len(attempt.nodes)], spec.options
+        own, note = spec.options, note_of(job, attempt)
+        placed = zip(spec.nodes, placements_of(attempt), strict=False)  # an elastic gang may have fewer nodes
         return Gang(
             job=job.id,
             attempt=attempt.number,
@@ -292,18 +293,17 @@ class Attempts:
             queue=job.queue,
             compute_environment=attempt.environment,
             main=spec.main,
-            commands=[node.command for node in nodes],
-            environments=[node.environment for node in nodes],
-            placements=placements_of(attempt),
+            nodes=[
+                GangNode(node.command, node.environment, placement, node.ranks, node.container, note)
+                for node, placement in placed
+            ],
             grace=GRACE,
             directory=own.directory or None,
             stall_timeout=own.stall_timeout,
             log_limit=own.log_limit,
-            ranks=[node.ranks for node in nodes],
             is_native=own.is_native,
             is_gang=job.kind == "multinode",
             isolated=not own.is_native,
-            containers=[node.container for node in nodes],
             array=None if job.array_index is None else (job.array_index, job.array_size or 0),
             bus=self.bus.endpoint,
             bus_token=self.bus.token(job.id, attempt.number),
@@ -311,7 +311,6 @@ class Attempts:
             timeout=job.timeout,
             priority=job.priority,
             options=options,
-            notes=notes_of(job, attempt),
         )
 
     def _stop(self, job: Job, attempt: Attempt, opened: _Open, stop: do.Stop) -> Gone | Delayed | None:

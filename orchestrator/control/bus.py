@@ -121,7 +121,7 @@ class Bus:
         self.stated: Callable[[Node, int | None, bool], None] = lambda *_: None
         """Called (on the network's thread) with the end of a node's log (None: it does not push it), and whether nothing follows."""
         self.is_followed: Callable[[str], bool] = lambda _: False
-        """Whether somebody follows the logs of this job: pushes of others are dropped unread."""
+        """Whether anyone follows the logs of this job: pushes of others are dropped unread."""
         self._home, self._kept, self._addresses = home, kept, addresses
         self._lock = threading.Lock()
         self._progress: dict[Node, dict[str, Any]] = {}

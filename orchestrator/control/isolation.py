@@ -123,7 +123,7 @@ class Isolation:
     def jobs(self, what: str, ids: Sequence[str], body: Callable[[Session, Job], Steps | None]) -> Sequence[str]:
         """Do something to these jobs, with commits that some share; where that fails, to fewer at a time. Returns those for which it failed.
 
-        They are logged once, say so as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
+        They are logged once, have it as their reason, and should be tried again when ``(what, job)`` need not wait any longer.
         Raises DatabaseError.
         """
         portions = (ids[start : start + _AT_ONCE] for start in range(0, len(ids), _AT_ONCE))

@@ -1,6 +1,6 @@
 """The hub of followed logs: nodes push their lines over the bus, and one reader a job fills what is missing for all followers.
 
-While somebody follows a job, its nodes are asked to push (:data:`shared_store.contract.bus.LOG_LEASE`), and each tells once a second where its log
+While a client follows a job, its nodes are asked to push (:data:`shared_store.contract.bus.LOG_LEASE`), and each tells once a second where its log
 ends. As long as all of them do and nothing is missing, nobody looks at a file. Otherwise (no bus, an engine without one, a lost push, a
 supervisor that knows no pushes) one look at the files serves all followers of the job. Files stay the truth.
 """
@@ -37,7 +37,7 @@ _SHARE = 0.005
 _AGAIN = 1.0
 """Seconds until a store or a database that can't be read is tried again."""
 _ROWS = 10.0
-"""Seconds after which the rows of all followed jobs are read, whether a commit has told of a change or not."""
+"""Seconds after which the rows of all followed jobs are read, whether a commit has reported a change or not."""
 _TICK = 1.0
 """Seconds between two rounds in which nothing happens."""
 _ASK, _ASK_SELDOM = 0.5, LOG_LEASE / 2
@@ -86,7 +86,7 @@ class Wakes(Protocol):
 
 
 class _Followed:
-    """A job that somebody follows."""
+    """A job that is followed."""
 
     def __init__(self, run: Run, job: str) -> None:
         self.logs = JobLogs(run, job)
@@ -200,7 +200,7 @@ class LogHub:
             self._hurry()
 
     def _run(self) -> None:
-        """Rounds while somebody follows a job, each as soon as one is due."""
+        """Rounds while a job is followed, each as soon as one is due."""
         pause = 0.0
         while True:
             with self._lock:

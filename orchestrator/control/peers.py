@@ -29,7 +29,7 @@ BEAT = 5.0
 GONE = 30.0
 """Seconds without a new heartbeat after which a controller counts as gone."""
 _OUTDATED = 3600.0
-"""Age [s] from which a heartbeat is no sign of life at first sight, whatever the difference between the machines' clocks."""
+"""Age [s] from which a heartbeat does not count at first sight, whatever the difference between the machines' clocks."""
 _LONGEST_NAME = 256
 
 

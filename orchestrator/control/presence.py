@@ -1,7 +1,7 @@
 """The presence of nodes: those that the bus hears, and what the others' silence proves. Pure: no network, no thread, no clock but the one it gets.
 
 Silence proves nothing by itself: the node may have died, its network may be down, or this controller is the one that is cut off. A node is
-lost once it alone has been silent for ``lost_after``, while its engine says that it runs and somebody else is heard. Otherwise it is
+lost once it alone has been silent for ``lost_after``, while its engine says that it runs and another node is heard. Otherwise it is
 unreachable, and waited for: for five times as long where its engine answers and can't tell, without end where the engine does not answer or
 says that it runs.
 """

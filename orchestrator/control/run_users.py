@@ -58,7 +58,7 @@ class RunUsers:
             return self._versions[hash(run) % _VERSIONS]
 
     def take(self, run: str) -> bool:
-        """Have the run for oneself until :meth:`let_go`; False where somebody uses it."""
+        """Have the run for oneself until :meth:`let_go`; False where a request uses it."""
         with self._lock:
             if run in self._users or run in self._taken:
                 return False

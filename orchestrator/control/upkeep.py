@@ -46,7 +46,7 @@ class Upkeep:
     def run(self) -> None:
         """Clear away what is due."""
         if machine.monotonic() - self._ran < INTERVAL or not self._writes.lock.acquire(blocking=False):
-            return  # somebody writes: gangs must not wait for that
+            return  # a request writes: gangs must not wait for that
         try:
             self._ran = machine.monotonic()
             self._delete_queues()

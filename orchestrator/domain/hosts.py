@@ -27,7 +27,7 @@ class Host:
     """Shared by the hosts of several engines that are one machine: capacity allocated on one is unavailable on the others. Empty: the
     machine is this host's alone."""
     queue: bool = False
-    """It is no machine but what an engine with a queue of its own gives to a gang at most: see :class:`Limit`."""
+    """It is not a machine but what an engine with a queue of its own gives to a gang at most: see :class:`Limit`."""
 
     @cached_property
     def resources(self) -> Resources:

@@ -40,6 +40,22 @@ class EngineFault(Transient):
 
 
 @dataclass(frozen=True)
+class GangNode:
+    """One node of a gang, as its job describes it."""
+
+    command: Sequence[str]
+    environment: Mapping[str, str]
+    """The job's own."""
+    placement: Placement
+    ranks: int = 1
+    """Training processes."""
+    container: Mapping[str, Any] = field(default_factory=dict)
+    """``containerProperties``, for what an engine makes of volumes, limits and the like."""
+    note: str = ""
+    """A line for the beginning of its log; empty for none."""
+
+
+@dataclass(frozen=True)
 class Gang:
     """All nodes of one attempt, as the controller hands them to an engine."""
 
@@ -53,10 +69,7 @@ class Gang:
     compute_environment: str
     """Name of the compute environment."""
     main: int
-    commands: Sequence[Sequence[str]]
-    environments: Sequence[Mapping[str, str]]
-    placements: Sequence[Placement]
-    """Commands, user environments and placements by node index."""
+    nodes: Sequence[GangNode]
     grace: float
     """Seconds between SIGTERM and SIGKILL."""
     directory: str | None
@@ -65,8 +78,6 @@ class Gang:
     """Seconds without an iteration after which a rank counts as stuck."""
     log_limit: int = LOG_LIMIT
     """Bytes of each node's log that are kept."""
-    ranks: Sequence[int] = ()
-    """Training processes by node index; empty: one on each."""
     is_native: bool = False
     """It came from a job YAML, so that each of its nodes has Muster."""
     is_gang: bool = True
@@ -75,10 +86,6 @@ class Gang:
     """Index and size, of an array's child."""
     isolated: bool = False
     """Its nodes start as containers would, also where they are plain processes: it came through the Batch API."""
-    containers: Sequence[Mapping[str, Any]] = ()
-    """``containerProperties`` by node index, for what an engine makes of volumes, limits and the like."""
-    notes: Sequence[str] = ()
-    """Lines for the beginning of the nodes' logs, by node index; empty texts for none."""
     bus: str | None = None
     bus_token: str | None = None
     """Address of the controller's bus router, and the attempt's credential for it."""
@@ -95,6 +102,10 @@ class Gang:
     @property
     def name(self) -> str:
         return f"{self.job}/{self.attempt}/{self.epoch}"
+
+    @property
+    def placements(self) -> list[Placement]:
+        return [node.placement for node in self.nodes]
 
 
 @dataclass(frozen=True)
@@ -126,20 +137,20 @@ class Plan(Generic[Request]):
 def node_plans(gang: Gang, addresses: Sequence[str], port: int) -> list[NodePlan]:
     """The plan of each node of ``gang``, where node ``i`` has ``addresses[i]`` and all meet at the main node's ``port``."""
     shared = {each.name: getattr(gang, each.name) for each in fields(NodeContract) if hasattr(gang, each.name)}
-    shared |= {"node_count": len(gang.placements), "main_index": gang.main}
+    shared |= {"node_count": len(gang.nodes), "main_index": gang.main}
     shared |= {"master_address": addresses[gang.main], "master_port": port}
     plans = []
-    for index, placement in enumerate(gang.placements):
+    for index, node in enumerate(gang.nodes):
         contract = NodeContract(
             **shared,
             node_index=index,
-            ranks_per_node=gang.ranks[index] if gang.ranks else 1,
-            isolation=_isolation(gang, index),
-            cpus=placement.cpus,
+            ranks_per_node=node.ranks,
+            isolation=_isolation(gang, node),
+            cpus=node.placement.cpus,
             address=addresses[index],
-            note=gang.notes[index] if gang.notes else "",
+            note=node.note,
         )
-        plans.append(NodePlan(contract, gang.commands[index], gang.environments[index], placement))
+        plans.append(NodePlan(contract, node.command, node.environment, node.placement))
     return plans
 
 
@@ -148,11 +159,10 @@ def unused_user(user: str, why: str) -> str:
     return f"muster: user {user} is not used: nodes run without the image, and {why}"
 
 
-def _isolation(gang: Gang, index: int) -> str:
+def _isolation(gang: Gang, node: GangNode) -> str:
     if not gang.isolated:
         return ""
-    image = gang.containers[index].get("image") if gang.containers else None
-    return "muster" if image in (None, "", "muster") else "image"
+    return "muster" if node.container.get("image") in (None, "", "muster") else "image"
 
 
 @dataclass(frozen=True)
@@ -230,7 +240,7 @@ class NodeStatus:
     address: str = ""
     words: str = ""
     """For people; nothing is decided by them. Why it does not run yet or can't be seen (then they are never empty); of one that has
-    ended, what its supervisor said where it could not say it in the store, or what the engine says of its end."""
+    ended, what its supervisor printed where it could not write to the store, or what the engine says of its end."""
     cause: Cause | None = None
     """The cause of its end; None while it runs, or if the engine can't say."""
     exit_code: int | None = None
@@ -365,7 +375,7 @@ class Engine(Protocol):
         """``Hosts`` to place gangs on, or ``Queued`` of an engine that queues and places them by itself: always the same of the two.
 
         Names of hosts begin with the engine's and a slash. Until the first answer the engine's jobs wait, and its controller goes
-        on without it. Raises EngineError where it can't be told now: the last answer counts, and the engine's health says why.
+        on without it. Raises EngineError where it isn't known now: the last answer counts, and the engine's health says why.
         """
         ...
 

@@ -77,7 +77,7 @@ class EngineSet:
         return sorted({engine.address for engine in self.engines.values() if engine.address})
 
     def capacity(self, names: Iterable[str] | None = None, patience: float = 0.0) -> Mapping[str, Capacity]:
-        """The capacity of all engines, or of these, by their names, as each told it last; without those that have not told it yet.
+        """The capacity of all engines, or of these, by their names, as each reported it last; without those that have not reported it yet.
 
         ``patience``: seconds to wait for newer answers, at most. The controller's own loop waits for none.
         """
@@ -87,7 +87,7 @@ class EngineSet:
         return {name: capacity for name, capacity in known.items() if capacity is not None}
 
     def unknown(self) -> Mapping[str, str]:
-        """Why it is not known what an engine has, by the names of those that have not told it yet."""
+        """Why it is not known what an engine has, by the names of those that have not reported it yet."""
         return {name: why for name, runner in self._runners.items() if (why := runner.unknown) is not None}
 
     def health(self) -> Mapping[str, Health]:
@@ -99,24 +99,26 @@ class EngineSet:
         runner = self._runner(engine_of(gang.placements[0].host))
         engine, traits = runner.engine, runner.engine.traits
         name = f"the {engine.name} engine"
-        if not traits.images and not all(gang.commands):
+        if not traits.images and not all(node.command for node in gang.nodes):
             raise EngineError(f"the job has no command, and {name} runs no image that could have one; give it one")
-        images = {str(container.get("image") or "muster") for container in gang.containers} - {"muster"}
+        images = {str(node.container.get("image") or "muster") for node in gang.nodes} - {"muster"}
         if images and not traits.images and gang.options.get("images") == "refuse":
             raise EngineError(
                 f"image {min(images)}: {name} runs commands in its nodes' own environment, and compute environment "
                 f"{gang.compute_environment} refuses other images (tag muster:images)"
             )
-        if _has_secrets(gang.containers) and traits.secrets is SecretValues.NONE:
+        if _has_secrets(gang) and traits.secrets is SecretValues.NONE:
             raise EngineError(f"secrets: {name} has no safe way to hand them to its nodes")
         if traits.images:  # its containers are what others have to imitate
             gang = replace(gang, isolated=False)
         elif not traits.users:
             why = f"{name} runs jobs as the user of its nodes"
-            users = [container.get("user") for container in gang.containers]
-            unused = [unused_user(user, why) if user else "" for user in users]
-            before = gang.notes or [""] * len(unused)
-            gang = replace(gang, notes=["; ".join(filter(None, notes)) for notes in zip(before, unused, strict=True)])
+            nodes = list(gang.nodes)
+            for index, node in enumerate(nodes):
+                if user := node.container.get("user"):
+                    note = "; ".join(filter(None, (node.note, unused_user(user, why))))
+                    nodes[index] = replace(node, note=note)
+            gang = replace(gang, nodes=nodes)
         if gang.bus and engine.address:
             gang = replace(gang, bus=f"tcp/{engine.address}:{gang.bus.rpartition(':')[2]}")
         return runner.plan(gang)
@@ -127,13 +129,14 @@ class EngineSet:
         Raises EngineError.
         """
         way = self._traits(engine_of(gang.placements[0].host)).secrets
-        if way is not SecretValues.ENVIRONMENT or not _has_secrets(gang.containers):
+        if way is not SecretValues.ENVIRONMENT or not _has_secrets(gang):
             return gang
         try:
-            values = [self.secrets.of(container, gang.queue) for container in gang.containers]
+            values = [self.secrets.of(node.container, gang.queue) for node in gang.nodes]
         except SecretsError as error:
             raise EngineError(str(error)) from None
-        return replace(gang, environments=[{**a, **b} for a, b in zip(gang.environments, values, strict=True)])
+        supplied = zip(gang.nodes, values, strict=True)
+        return replace(gang, nodes=[replace(node, environment={**node.environment, **more}) for node, more in supplied])
 
     def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]], queue: str) -> None:
         """Raises SecretsError where a job of this queue on one of these engines can't have the secrets that it requests."""
@@ -209,8 +212,8 @@ class EngineSet:
             raise NotYet(_not_served(name), unknown=True) from None  # something of the gang may run there
 
 
-def _has_secrets(containers: Iterable[Mapping[str, Any]]) -> bool:
-    return any(container.get("secrets") for container in containers)
+def _has_secrets(gang: Gang) -> bool:
+    return any(node.container.get("secrets") for node in gang.nodes)
 
 
 def _not_served(name: str) -> str:

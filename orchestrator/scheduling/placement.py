@@ -68,7 +68,7 @@ def limit_of(hosts: Iterable[Host]) -> str | None:
 
 
 def _too_few_hosts(shape: Shape, hosts: Sequence[Host]) -> str | None:
-    """A message that there are too few hosts, if each takes one node; None if that is not the reason."""
+    """A message that hosts are too few, if each takes one node; None if that is not the reason."""
     if not all(host.single for host in hosts):
         return None
     demanded = {"": (shape.minimum, len(hosts))}

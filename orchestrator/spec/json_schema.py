@@ -51,7 +51,7 @@ def _add_tasks(definitions: dict[str, Any]) -> None:
             continue
         try:
             config = TypeAdapter(kind).json_schema(ref_template=f"#/$defs/{task}_{{model}}")
-        except PydanticUserError:  # a type of somebody's class that JSON does not have
+        except PydanticUserError:  # a type of a user's class that JSON does not have
             continue
         definitions |= {f"{task}_{name}": each for name, each in config.pop("$defs", {}).items()}
         condition = {"properties": {"task": {"const": task}}, "required": ["task"]}

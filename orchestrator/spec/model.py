@@ -376,7 +376,7 @@ def _problem_of(train: _Train) -> Problem | None:
             if problem:
                 path, words = problem
                 return ("train", train.algorithm, *path), words
-    except Exception:  # a defect of somebody's class: its rank shows the traceback
+    except Exception:  # a defect of a user's class: its rank shows the traceback
         return None
     return None
 
@@ -384,7 +384,7 @@ def _problem_of(train: _Train) -> Problem | None:
 def _notes_of(train: _Train) -> list[str]:
     """Notes on values of the task's configuration, which is valid as far as it is known here."""
     kind, found = task_config(train.task), list[str]()
-    with suppress(Exception):  # a defect of somebody's class: its rank shows the traceback
+    with suppress(Exception):  # a defect of a user's class: its rank shows the traceback
         found += kind.configured(train.config).notes(train.algorithm) if kind and train.config else ()
     return found
 

@@ -1,6 +1,6 @@
 """Faults: the Python exceptions that would end the next attempt of a job as they ended this one, known by type, file, line and cause.
 
-Memory, signals, hosts, volumes, networks, GPUs and collectives fail by chance or because something else did: their exceptions are no faults.
+Memory, signals, hosts, volumes, networks, GPUs and collectives fail by chance or because something else did: their exceptions do not count as faults.
 """
 
 from __future__ import annotations

@@ -229,7 +229,7 @@ def blamed(place: str) -> Iterator[None]:
         yield
     except PluginError:
         raise
-    except Exception as error:  # of somebody's code, which may do anything
+    except Exception as error:  # of a user's code, which may do anything
         raise failed(place, error) from error
 
 
@@ -246,7 +246,7 @@ def _imported(place: str) -> Any:
         return reduce(getattr, filter(None, name.split(".")), import_module(module))
     except PluginError:  # of a declaration, which the module makes
         raise
-    except (Exception, SystemExit) as error:  # of somebody's code, which may do anything
+    except (Exception, SystemExit) as error:  # of a user's code, which may do anything
         raise PluginError(
             f"{place} can't be imported ({_words(error)}); install its package again, or remove it"
         ) from error
@@ -285,7 +285,7 @@ def plugins() -> Mapping[str, Plugin]:
             _check("its entry point", place, _PLACE)
             plugin = _imported(place)
             if not isinstance(plugin, Plugin):
-                raise PluginError(f"{place} is no Plugin of {__name__}")
+                raise PluginError(f"{place} is not a Plugin of {__name__}")
         except PluginError as error:
             raise PluginError(f"plug-in {name} of the package {package}: {error}") from error
         found[name], owners[name] = plugin, package
@@ -322,13 +322,13 @@ def sections() -> Mapping[str, JobSection]:
 
 
 def rules_of(key: str) -> EvaluationRules | None:
-    """The rules by which a section evaluates; None of one that is no plug-in's. Raises PluginError."""
+    """The rules by which a section evaluates; None of one that is not a plug-in's. Raises PluginError."""
     if (section := sections().get(key)) is None:
         return None
     rules: EvaluationRules = load(section.rules)
     if missing := [each for each in ("count", "refusal", "changes", "key_of", "lines") if not hasattr(rules, each)]:
         raise PluginError(
-            f"{_declared_in(section.rules)}: {section.rules} is no EvaluationRules: it has no {missing[0]}"
+            f"{_declared_in(section.rules)}: {section.rules} is not an EvaluationRules: it has no {missing[0]}"
         )
     return rules
 

@@ -172,7 +172,7 @@ class Action(_Part):
     rule: str = ""
     """The rule by which the input follows from ``value = offset + scale * action``, in words; empty: it is the value itself."""
     targets: tuple[Target, ...] = ()
-    """The effect of a choice on the joints, the same joints for each choice; empty: it is no choice, or the task does not declare it."""
+    """The effect of a choice on the joints, the same joints for each choice; empty: it is not a choice, or the task does not declare it."""
 
 
 @dataclass(frozen=True)

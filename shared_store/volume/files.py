@@ -286,7 +286,7 @@ def read_manifest(
         raise damaged(f"{MANIFEST} lists no files")
     for name, entry in files.items():
         if not names.fullmatch(name) or name == MANIFEST:
-            raise damaged(f"{MANIFEST} names {name[:60]!r}, which is no file of it")
+            raise damaged(f"{MANIFEST} names {name[:60]!r}, which is not a file of it")
         size, digest = (entry.get("size"), entry.get("sha256")) if isinstance(entry, dict) else (None, None)
         if type(size) is not int or not 0 <= size < 2**63 or not isinstance(digest, str):
             raise damaged(f"{MANIFEST} has no size and digest of {name}")

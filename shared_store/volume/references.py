@@ -100,7 +100,7 @@ def _of_plugin(place: str, store: Store) -> Found:
             yield each
     except _READING:
         raise
-    except Exception as error:  # of somebody's code, which may do anything
+    except Exception as error:  # of a user's code, which may do anything
         raise failed(place, error) from error
 
 

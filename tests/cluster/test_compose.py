@@ -135,7 +135,7 @@ def test_a_training_survives_two_workers_and_the_controller(cluster: Cluster, do
     mine = {"label": [f"com.docker.compose.project={cluster.project}", "com.docker.compose.service=worker"]}
     first, second = random.sample(docker_client.containers.list(filters=mine), 2)
     os.kill(first.attrs["State"]["Pid"], signal.SIGKILL)  # a crash: the container comes back by itself
-    second.kill()  # somebody's `docker kill`: it does not
+    second.kill()  # a user's `docker kill`: it does not
     wait_for(lambda: len(cluster.hosts()) == NODES - 1, 120, "one is noticed to be gone for good")
     cluster.compose("kill", "controller")
     cluster.up()

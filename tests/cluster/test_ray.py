@@ -1,4 +1,4 @@
-"""The Ray engine on a real cluster: gangs placed, told where they are, stopped, lost and found again; nothing is left of them."""
+"""The Ray engine on a real cluster: gangs placed, observed, stopped, lost and found again; nothing is left of them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_hosts_are_the_nodes_that_have_cpus(bench: RayBench) -> None:
     assert hosts["ray/n1"].single and bench.engine.address is None
 
 
-def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_are_told(bench: RayBench) -> None:
+def test_a_gang_starts_main_node_first_with_exactly_its_contract_and_its_ends_are_reported(bench: RayBench) -> None:
     script = (
         "env > $MUSTER_STORE/env-$AWS_BATCH_JOB_NODE_INDEX; pwd; "
         "shim=$(sed 's/.*) //' /proc/$PPID/stat | cut -d' ' -f2); "  # the supervisor's parent: what the engine started
@@ -84,7 +84,7 @@ def test_asked_to_leave_then_made_to_and_the_next_attempt_finds_its_place_kept(b
     assert bench.stopped(second, 0.5) == [137, 137]
 
 
-def test_what_the_driver_is_told_is_the_request_of_the_plan(bench: RayBench) -> None:
+def test_what_the_driver_reads_is_the_request_of_the_plan(bench: RayBench) -> None:
     gang = bench.gang(nodes=2, main=1, bus="tcp/127.0.0.1:1", bus_token="the credential")
     plan = bench.engine.plan(gang)
     bench.ready(gang)
@@ -199,7 +199,7 @@ def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: RayBench)
     wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "it is back")
 
 
-def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: RayBench) -> None:
+def test_a_node_that_has_to_leave_has_the_gang_save_and_leave(bench: RayBench) -> None:
     [node] = [node["id"] for node in bench.engine._watch.seen["nodes"] if node["name"] == "n2"]
     handle = bench.ready(bench.gang(POLITE, 2))
     notice = ["--reason=DRAIN_NODE_REASON_PREEMPTION", "--reason-message=spot", "--deadline-remaining-seconds=60"]
@@ -213,7 +213,7 @@ def test_a_node_that_is_told_to_leave_has_the_gang_save_and_leave(bench: RayBenc
     wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "its successor is one")
 
 
-def test_a_driver_that_is_told_to_end_has_its_gang_save_and_leaves_one_that_waits_to_the_next_driver(
+def test_a_driver_that_has_to_end_has_its_gang_save_and_leaves_one_that_waits_to_the_next_driver(
     bench: RayBench,
 ) -> None:
     handle = bench.ready(bench.gang(POLITE, cpus=2.0))
@@ -261,7 +261,7 @@ def test_a_head_that_is_killed_and_comes_back_costs_nothing(bench: RayBench) -> 
             r"RAY_ADDRESS is 'ray://head:10001'; the host:port of the cluster's head is needed",
         ),
         (
-            {"RAY_AUTH_TOKEN": "another-token-of-somebody"},
+            {"RAY_AUTH_TOKEN": "another-token-of-someone"},
             "wants its token, and another one is set here: RAY_AUTH_MODE=token with",
         ),
         ({"RAY_AUTH_MODE": "disabled"}, "wants its token, and none is set here"),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -68,3 +69,18 @@ def _ip(*arguments: str) -> None:
     done = subprocess.run(["ip", *arguments], capture_output=True, text=True)
     if done.returncode:
         raise OSError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
+
+
+def free_ports(count: int) -> list[int]:
+    """Ports that nobody has just now, below those that the kernel hands out: no connection takes them while their server is down."""
+    found: list[int] = []
+    candidate = 20000 + os.getpid() * 16 % 12000
+    while len(found) < count:
+        candidate += 1
+        with socket.socket() as probe:
+            try:
+                probe.bind(("", candidate))
+                found.append(candidate)
+            except OSError:
+                continue
+    return found

@@ -38,7 +38,7 @@ _GRACE = 25.0
 _CAPACITY_AGE = 60.0
 """Seconds for which AWS's answer about its size is kept."""
 _ENDING = STRAGGLE + 60.0
-"""Seconds that AWS may take to end a job before its controller is told that it does not."""
+"""Seconds that AWS may take to end a job before its controller learns that it does not."""
 _REMEMBERED = 256
 """Gangs whose end is kept: the controller asks once more after it, and after a restart it asks anew."""
 _MEMORY = 32 * 1024
@@ -85,7 +85,7 @@ class AwsBatchEngine:
         """The limits of the queue's compute environments.
 
         AWS tells vCPUs only. No type of instance has more than a GPU for every four of them, or more than 32 GiB for each: that
-        is taken as their number, and what does not exist waits there with AWS's own reason. Until AWS has told them, for which it
+        is taken as their number, and what does not exist waits there with AWS's own reason. Until AWS has reported them, for which it
         may lack a permission, ``max_vcpus`` of the configuration counts.
 
         Raises NotYet where AWS did not answer the last time: its last answer may be wrong.

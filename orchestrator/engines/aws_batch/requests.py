@@ -12,7 +12,7 @@ from itertools import groupby
 from typing import Any
 
 from orchestrator.domain.gang import FARGATE_MEMBERS
-from orchestrator.engines.api import EngineError, Gang, NodePlan
+from orchestrator.engines.api import EngineError, Gang, GangNode, NodePlan
 from orchestrator.engines.aws_batch.config import AwsConfig
 from shared_store import __version__
 from shared_store.contract.node import sealed_in_image
@@ -60,10 +60,10 @@ def requests_for(gang: Gang, nodes: list[NodePlan], config: AwsConfig) -> Reques
     """
     if len(nodes) > _MOST_NODES:
         raise EngineError(f"{len(nodes)} nodes: AWS Batch takes at most {_MOST_NODES} in one job")
-    plain = [not _has_muster(gang, index, config) for index in range(len(nodes))]
+    plain = [not (gang.is_native or _has_muster(_image(node), config)) for node in gang.nodes]
     if missing := [index for index, each in enumerate(plain) if not each and not nodes[index].command]:
         raise EngineError(
-            f"node {missing[0]} has no command, and that of image {_image(gang, missing[0]) or 'muster'} can't be looked up at AWS to "
+            f"node {missing[0]} has no command, and that of image {_image(gang.nodes[missing[0]]) or 'muster'} can't be looked up at AWS to "
             "run it under Muster's supervisor; give it one"
         )
     ranges, overrides = [], []
@@ -109,9 +109,8 @@ def _name(text: str, most: int) -> str:
     return re.sub(r"[^A-Za-z0-9_-]", "_", text).lstrip("_-")[:most]
 
 
-def _has_muster(gang: Gang, index: int, config: AwsConfig) -> bool:
-    image = _image(gang, index)
-    return gang.is_native or image in ("", "muster") or _repository(image) == _repository(config.image)
+def _has_muster(image: str, config: AwsConfig) -> bool:
+    return image in ("", "muster") or _repository(image) == _repository(config.image)
 
 
 def _repository(image: str) -> str:
@@ -120,22 +119,20 @@ def _repository(image: str) -> str:
     return name.rpartition(":")[0] if ":" in name.rpartition("/")[2] else name
 
 
-def _image(gang: Gang, index: int) -> str:
-    return str(gang.containers[index].get("image") or "") if gang.containers else ""
+def _image(node: GangNode) -> str:
+    return str(node.container.get("image") or "")
 
 
 def _container(gang: Gang, node: NodePlan, config: AwsConfig, plain: bool) -> dict[str, Any]:
     """``containerProperties`` of a node: the job's own, with what Muster needs."""
-    index = node.contract.node_index
-    own = dict(gang.containers[index]) if gang.containers else {}
-    placement = node.placement
+    described, placement = gang.nodes[node.contract.node_index], node.placement
+    own, image = described.container, _image(described)
     resources = [
         {"type": "VCPU", "value": str(max(1, math.ceil(placement.cpus)))},
         {"type": "MEMORY", "value": str(placement.memory)},
     ]
     if placement.gpus:
         resources.append({"type": "GPU", "value": str(len(placement.gpus))})
-    image = _image(gang, index)
     container: dict[str, Any] = {
         **{key: value for key, value in own.items() if key not in _OURS and value not in ([], {}, None)},
         "image": config.image if image in ("", "muster") else image,

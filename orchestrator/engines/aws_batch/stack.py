@@ -85,7 +85,7 @@ class Stack:
                 f"stack {self.name} is in {status} and can't be updated; remove it with `muster aws down`, then try again"
             )
         if found and status.endswith("_IN_PROGRESS"):
-            return str(found["StackId"])  # somebody began already: follow that
+            return str(found["StackId"])  # another caller began already: follow that
         request = {
             "StackName": self.name,
             "TemplateBody": template,

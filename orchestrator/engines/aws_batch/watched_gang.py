@@ -42,7 +42,7 @@ class WatchedGang:
         self.stopped = False
         """It was stopped: nothing of it runs, and nothing copies its logs."""
         self._over_since: float | None = None
-        """When AWS first said that the job is over (monotonic [s])."""
+        """When AWS first reported that the job is over (monotonic [s])."""
         self._ended: dict[int, float] = {}
         """By node: when it was first seen to have ended (monotonic [s])."""
 

@@ -139,7 +139,7 @@ class DockerEngine:
             with answered():
                 listed = self._listed()
         except NotYet as error:
-            if not self._unreachable:  # said once, not at every look
+            if not self._unreachable:  # reported once, not at every look
                 log.warning("engine docker: %s", error)
             self._unreachable = True
             return [
@@ -193,9 +193,9 @@ class DockerEngine:
         gang = plan.gang
         images = [self._image(request.image) for request in plan.request]
         existing = self._containers(gang.name)
-        for index, (image, command) in enumerate(zip(images, gang.commands, strict=True)):
+        for index, (image, node) in enumerate(zip(images, gang.nodes, strict=True)):
             if index not in existing:
-                _check_image(plan.request[index].image, image, command)
+                _check_image(plan.request[index].image, image, node.command)
         network, subnet = self._network(gang.name)
         addresses = _addresses(subnet, len(gang.placements))
         requests = [r.at(addresses[index], addresses[gang.main]) for index, r in enumerate(plan.request)]
@@ -212,7 +212,7 @@ class DockerEngine:
                     self._follow(container, handle, index)
         except BaseException as error:
             self._remove(gang.name)  # never half a gang
-            # 500: it has tried, and said why it can't; beyond that nobody has
+            # 500: it has tried, and reported why it can't; beyond that nobody has
             if isinstance(error, APIError) and (error.status_code or 500) <= 500:
                 why = f"CannotStartContainerError: Error response from daemon: {error.explanation}"
                 raise CannotStart(why) from error

@@ -51,7 +51,7 @@ class FollowedLog:
         return self.trouble is not None and time.monotonic() - self._ended > _AGAIN
 
     def wait(self, seconds: float | None = None) -> bool:
-        """Whether it has ended, by itself or in trouble, within that time."""
+        """Whether it has ended, by itself or by an error, within that time."""
         self._thread.join(seconds)
         return not self._thread.is_alive()
 

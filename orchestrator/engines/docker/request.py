@@ -48,7 +48,7 @@ class ContainerRequest:
 
         Args:
             entrypoint: The image's own.
-            default: Its ``CMD``, for a job that has no command. Docker takes it by itself only where it is told no entrypoint either.
+            default: Its ``CMD``, for a job that has no command. Docker takes it by itself only where no entrypoint is passed either.
             kernels: Directory for compiled kernels; None for an image without Muster, whose command runs without a supervisor.
         """
         contract = self.contract.to_env()
@@ -79,7 +79,7 @@ class ContainerRequest:
 def container_request(gang: Gang, node: NodePlan, cores: float) -> ContainerRequest:
     """The request for one node of ``gang``; ``cores``: of the machine."""
     index = node.contract.node_index
-    container = gang.containers[index]
+    container = gang.nodes[index].container
     return ContainerRequest(
         image=str(container.get("image") or ""),
         name=f"muster-{gang.name.replace('/', '-')}-{index}",

@@ -113,8 +113,8 @@ class LocalEngine:
     def plan(self, gang: Gang) -> Plan[Sequence[NodeProcess]]:
         addresses = [_address(gang, index) for index in range(len(gang.placements))]
         nodes = node_plans(gang, addresses, first_port(gang.name))
-        for index, container in enumerate(gang.containers):
-            if user := container.get("user"):
+        for index, each in enumerate(gang.nodes):
+            if user := each.container.get("user"):
                 taken, note = _user(user)
                 nodes[index] = replace(nodes[index], contract=replace(nodes[index].contract, user=taken, note=note))
         if self._memory and gang.isolated:  # of a job from YAML it is for the scheduler alone
@@ -211,9 +211,8 @@ class LocalEngine:
         gpus = ",".join(node.placement.gpus)
         environment = node_environment(own, gpus, node.environment, node.contract.to_env())
         index = node.contract.node_index
-        container = gang.containers[index] if gang.containers else {}
         group = f"{self._groups}/{_group_name(gang.name, index)}" if self._groups else ""
-        command = with_mounts(supervised(node.command), mounts_of(container, gang.store))
+        command = with_mounts(supervised(node.command), mounts_of(gang.nodes[index].container, gang.store))
         exit_file = str(self._left(gang.name, index, "exit"))
         whole = shimmed(command, group, files=self._files, exit_file=exit_file)
         return NodeProcess(whole, environment, group, gang.directory)

@@ -168,7 +168,7 @@ class Driver:
                 self._partial += os.read(self.commands, 65536)
 
     def watch(self) -> None:
-        """In a thread, since it waits where the head is away: which nodes are told to leave."""
+        """In a thread, since it waits where the head is away: which nodes have to leave."""
         while True:
             with contextlib.suppress(ray.exceptions.RaySystemError):
                 self._draining = set(ray._private.state.state.get_draining_nodes())

@@ -52,7 +52,7 @@ DEFAULT_ADDRESS = "127.0.0.1:6379"
 _DRIVERS = 3
 """How many drivers are started for a gang after one that died before it had started anything."""
 _SUSPECT, _SUSPECT_IF_SILENT = 20.0, 70.0
-"""Seconds for which a machine that lost its part of a gang is no host: until Ray, too, knows whether it is there."""
+"""Seconds for which a machine that lost its part of a gang does not count as a host: until Ray, too, knows whether it is there."""
 _ENDING = 4 * LEASE
 """Seconds beyond the grace time that a gang may take to end: a driver that hangs is killed after two leases, its actors follow in one."""
 _KEPT = 7 * 86400.0
@@ -72,7 +72,7 @@ class RayEngine:
 
         Raises:
             EngineError: Ray is not installed, the cluster does not answer, wants another token or has other versions, or this
-                machine is no node of it.
+                machine is not a node of it.
         """
         self.home = home
         self.head = address or os.environ.get("RAY_ADDRESS") or DEFAULT_ADDRESS
@@ -233,7 +233,7 @@ class RayEngine:
     def _outwait(folder: Folder, gang: str) -> None:
         """The driver died. Ray ends the actors of a dead driver, and an actor that hears of none for a while ends itself."""
         folder.plan(gang).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # there is no sign of life of one that never joined the cluster
+        with contextlib.suppress(OSError):  # there is no heartbeat of one that never joined the cluster
             age = time.time() - folder.alive.stat().st_mtime
             time.sleep(min(max(0.0, LEASE + 1.0 - age), LEASE + 1.0))
         if state := read_json(folder.state(gang)):
@@ -297,8 +297,7 @@ class RayEngine:
 
 def _request(gang: Gang, node: NodePlan, machines: Mapping[str, Mapping[str, Any]]) -> NodeRequest:
     """A node's part of the request to the driver; ``machines``: those of the cluster, by host name. Raises EngineError."""
-    index, placement = node.contract.node_index, node.placement
-    container = gang.containers[index] if gang.containers else {}
+    placement, container = node.placement, gang.nodes[node.contract.node_index].container
     return NodeRequest(
         contract=node.contract,
         command=list(node.command),

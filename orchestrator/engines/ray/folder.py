@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 LEASE = 20.0
-"""Seconds without a sign of life between a driver and an actor after which each gives the other up: an actor ends its node."""
+"""Seconds without a heartbeat between a driver and an actor after which each gives the other up: an actor ends its node."""
 
 UNSTARTED = ("joining", "placing", "starting")
 """Phases of a gang before any command was started."""

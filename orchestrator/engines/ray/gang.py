@@ -23,7 +23,7 @@ from shared_store.process.ports import first_port
 from shared_store.volume.files import write_json
 
 _BEAT = 2.0
-"""Seconds between two signs of life to an actor."""
+"""Seconds between two heartbeats to an actor."""
 _BROKEN = 3.0
 """Seconds after which an actor whose connection broke, and that does not answer on another, is given up."""
 _ENDING = 15.0
@@ -43,7 +43,7 @@ class DrivenGang:
         self.placings = 0
         """How often it was placed."""
         self.deadline = self._next_beat = 0.0
-        """When a stop has to be done with, and when the next signs of life are due [monotonic s]."""
+        """When a stop has to be done with, and when the next heartbeats are due [monotonic s]."""
         self._reported: dict[str, Any] = {}
         """The state file's content."""
         self._unplace()
@@ -56,7 +56,7 @@ class DrivenGang:
         """Calls of actors that are not answered: a kind and a node's index."""
         self.last_replies = [time.monotonic()] * len(self.nodes)
         self.leaving: set[int] = set()
-        """Indices of nodes that were told to leave."""
+        """Indices of nodes that have to leave."""
         self.broken: dict[int, float] = {}
         """Since when the connection to an actor is broken."""
 

@@ -1,6 +1,6 @@
 """The actor of a gang's driver on each node of a Ray cluster: it starts the node's supervisor and ends it.
 
-It travels to the node by value, since that may have another version of Muster, or none: that has to be said in words. So it imports
+It travels to the node by value, since that may have another version of Muster, or none: that has to be reported. So it imports
 nothing but the standard library. Python and Muster are those of the node.
 """
 

@@ -211,7 +211,7 @@ class SlurmEngine:
         return jobs
 
     def _cancel(self, number: str) -> None:
-        """Cancel a job, and remember that it was not somebody else who did."""
+        """Cancel a job, and remember that it was this controller."""
         taken, known = self._jobs.taken, self._jobs.value
         for each, at in list(self._cancelled.items()):
             if each not in known and at < taken:  # an older view may not have it yet

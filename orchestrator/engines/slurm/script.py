@@ -87,8 +87,8 @@ def _check(gang: Gang) -> None:
         raise EngineError(
             f"Slurm requires identical nodes, these differ ({sizes}); give all of them the largest resources"
         )
-    for container in gang.containers:
-        if mounts := mounts_of(container, gang.store):
+    for node in gang.nodes:
+        if mounts := mounts_of(node.container, gang.store):
             raise EngineError(
                 f"volume {mounts[0].target}: the slurm engine mounts nothing; take the volumes out of the job definition "
                 "and use $MUSTER_STORE, or a path of the cluster's shared file system"

@@ -95,7 +95,7 @@ def list_jobs() -> dict[str, SlurmJob]:
     found = {}
     for line in call("squeue", "--noheader", "--states=all", "--user", me, "--format=%A|%T|%r|%N|%k").splitlines():
         fields = line.split("|", 4)
-        if len(fields) == 5:  # a comment of somebody's may have lines
+        if len(fields) == 5:  # a user's comment may have lines
             found[fields[0]] = SlurmJob(*fields)
     return found
 

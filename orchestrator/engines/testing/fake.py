@@ -68,7 +68,7 @@ class FakeEngine:
         return self.offered
 
     def plan(self, gang: Gang) -> Plan[Gang]:
-        return Plan(gang, node_plans(gang, [f"10.0.0.{index + 1}" for index in range(len(gang.commands))], 29500), gang)
+        return Plan(gang, node_plans(gang, [f"10.0.0.{index + 1}" for index in range(len(gang.nodes))], 29500), gang)
 
     def launch(self, plan: Plan[Gang]) -> Handle:
         self._called()

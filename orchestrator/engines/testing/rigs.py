@@ -9,7 +9,7 @@ from types import TracebackType
 from typing import Any, Protocol, Self
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus
+from orchestrator.engines.api import Engine, Gang, GangNode, Handle, NodeStatus
 from orchestrator.engines.testing.fake import FakeCluster, FakeEngine
 from orchestrator.engines.toolkit.statuses import observing_several
 from shared_store.volume.epoch import raise_epoch, read_epoch
@@ -140,11 +140,13 @@ def make_gang(
         queue="default",
         compute_environment=host.partition("/")[0],
         main=0,
-        commands=[list(command)] * nodes,
-        environments=[{"MUSTER_ON_CHILD_FAILURE": "ignore"}] * nodes,
-        placements=[Placement(host, (), 0.2, 64)] * nodes,
+        nodes=[
+            GangNode(
+                list(command), {"MUSTER_ON_CHILD_FAILURE": "ignore"}, Placement(host, (), 0.2, 64), container=container
+            )
+            for container in containers or [{}] * nodes
+        ],
         grace=1.0,
         directory=None,
         is_native=True,
-        containers=containers,
     )

@@ -51,8 +51,8 @@ class EngineSuite:
             contract = node.contract
             assert (contract.gang, contract.node_count, contract.main_index) == (gang.name, 2, 0)
             assert (contract.run, contract.epoch) == (gang.run, gang.epoch)
-            assert list(node.command) == list(gang.commands[index]), "the job's own command"
-            assert dict(node.environment) == dict(gang.environments[index]), "the job's own environment"
+            assert list(node.command) == list(gang.nodes[index].command), "the job's own command"
+            assert dict(node.environment) == dict(gang.nodes[index].environment), "the job's own environment"
 
     def test_every_node_runs_and_ends_with_its_own_exit_code(self, rig: Rig) -> None:
         handle = launch(rig, "codes", len(_TAKEN))

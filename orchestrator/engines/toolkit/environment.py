@@ -1,4 +1,4 @@
-"""The environment that an engine's processes have from the controller's own: what programs need to run, and what somebody names."""
+"""The environment that an engine's processes have from the controller's own: what programs need to run, and what a user names."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FAMILIES = (
 )
 """What the names of the settings of interpreters, libraries and Muster itself begin with."""
 _SECRET = re.compile(r"(KEY|TOKEN|PASSWORD|PASSWD|SECRET|CREDENTIAL)S?$")
-"""How the names of secrets end: such a variable is inherited only if somebody names it, whatever its family."""
+"""How the names of secrets end: such a variable is inherited only if a user names it, whatever its family."""
 
 
 def named_variables() -> list[str]:
@@ -49,7 +49,7 @@ def inherited(
     """This process's variables that jobs may have.
 
     Args:
-        withheld, prefixes: Names, and beginnings of names, that are left out, too, unless somebody names them.
+        withheld, prefixes: Names, and beginnings of names, that are left out, too, unless a user names them.
         kept: Names that stay all the same, private or not.
         named: Others that jobs get; None: :func:`named_variables`.
     """

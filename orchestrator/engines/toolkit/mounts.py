@@ -61,7 +61,7 @@ def with_mounts(command: Sequence[str], mounts: Sequence[Mount], engine: str = "
     Args:
         command: What is to be run.
         mounts: What it sees.
-        engine: Name of the engine that will run it, for what is said.
+        engine: Name of the engine that will run it, for messages.
 
     Raises:
         EngineError: This process may not mount, or a path can't be used.

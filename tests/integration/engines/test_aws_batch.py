@@ -104,19 +104,6 @@ def workstation(aws: Serving, tmp_path: Path) -> Iterator[AwsBench]:
     found.close()
 
 
-def test_one_node_that_fails_tells_why_with_the_error_of_its_rank(bench: AwsBench) -> None:
-    script = (
-        "import json, os, time\n"
-        "error = {'message': {'message': 'RuntimeError: no', 'extraInfo': {'py_callstack': 'trace', 'timestamp': '1'}}}\n"
-        "json.dump(error, open(os.environ['TORCHELASTIC_ERROR_FILE'], 'w')); raise SystemExit(3)"
-    )
-    handle = bench.launch(bench.gang(nodes=1, commands=[["python", "-c", script]]))
-    [node] = bench.ended(handle)
-    outcome = bench.outcome(0)
-    assert node.exit_code == 3 and outcome.exit_code == 3
-    assert outcome.error is not None and outcome.error.message == "RuntimeError: no", outcome
-
-
 def test_the_requests_carry_image_volume_shared_memory_and_logs(aws: Serving, tmp_path: Path) -> None:
     bench = AwsBench(aws, tmp_path, image="1.dkr.ecr/muster:2", file_system="fs-1", access_point="fsap-1", efa=True)
     gang = bench.gang(nodes=3, timeout=100, placements=[Placement("h", ("0", "1"), 3.5, 4096)] * 3)
@@ -310,7 +297,7 @@ def test_a_gang_that_waits_says_why_also_while_aws_is_away(bench: AwsBench, monk
     ):
         bench.engine.stop(handle, 0)
     [node] = status_of(bench.engine, handle)
-    assert "500" in node.words and "does not answer" in node.stale, "the last status, told as an old one"
+    assert "500" in node.words and "does not answer" in node.stale, "the last status, reported as an old one"
     monkeypatch.setattr(aws_batch, "_CAPACITY_AGE", 0.0)
     with pytest.raises(NotYet, match="AWS Batch does not tell its capacity"):
         bench.engine.capacity()

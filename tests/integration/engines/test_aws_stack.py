@@ -248,7 +248,7 @@ def test_batch_runs_multi_node_jobs_on_instances_of_one_zone(account: Account) -
 
 
 def test_the_compute_environment_can_be_changed_where_it_is_and_a_failed_create_leaves_no_volume() -> None:
-    """Moto allows it and AWS does not: an update in place with a service role of one's own."""
+    """Moto allows it and AWS does not: an update in place with a custom service role."""
     environment, volume = RESOURCES["ComputeEnvironment"]["Properties"], RESOURCES["FileSystem"]
     assert environment["ReplaceComputeEnvironment"] is False and "ServiceRole" not in environment
     assert (volume["DeletionPolicy"], volume["UpdateReplacePolicy"]) == ("RetainExceptOnCreate", "Retain")

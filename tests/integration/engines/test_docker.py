@@ -80,10 +80,10 @@ def test_a_plain_image_runs_plainly_and_its_log_and_outcome_are_in_the_store(ben
     assert sorted(bench.log()) == [f"hello from {index} of 3" for index in range(3)]
     ends = [(outcome.exit_code, outcome.reason) for outcome in map(bench.outcome, range(3))]
     assert ends == [(0, "done"), *((code, f"container exited with code {code}") for code in (1, 2))]
-    assert bench.stopped(handle) == [0, 1, 2], "told to the end"
+    assert bench.stopped(handle) == [0, 1, 2], "reported to the end"
 
 
-def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_told(bench: DockerBench) -> None:
+def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_receive(bench: DockerBench) -> None:
     script = (
         "import os, socket, sys, time\n"
         "here, main = os.environ['MUSTER_ADDRESS'], os.environ['MASTER_ADDR']\n"
@@ -106,7 +106,7 @@ def test_nodes_meet_on_a_network_of_their_own_at_the_addresses_that_they_are_tol
     assert not set(other.facts["addresses"]) & set(addresses)
 
 
-@pytest.mark.parametrize("reported", [True, False], ids=["the gateway is told", "an engine that leaves it out"])
+@pytest.mark.parametrize("reported", [True, False], ids=["the gateway is reported", "an engine that leaves it out"])
 def test_containers_reach_this_machine_where_the_engine_says(
     bench: DockerBench, monkeypatch: pytest.MonkeyPatch, reported: bool
 ) -> None:
@@ -211,7 +211,7 @@ def test_a_log_read_slowly_is_copied_to_its_end(bench: DockerBench, monkeypatch:
         assert [line.text for line in lines if line.node == node] == [*map(str, range(100_000, 160_001)), "the error"]
 
 
-def test_a_log_that_can_not_be_written_is_copied_once_it_can(bench: DockerBench) -> None:
+def test_a_log_that_can_t_be_written_is_copied_once_it_can(bench: DockerBench) -> None:
     log = bench.run.log(bench.job, 1, 0)
     log.mkdir(parents=True)
     long = "x" * 40_000  # Docker keeps it in pieces of 16 KiB

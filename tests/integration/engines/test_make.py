@@ -77,7 +77,7 @@ def test_a_missing_registry_or_image_is_reported_in_one_line() -> None:
 # -- make cluster -------------------------------------------------------------------------------------------------------
 
 DOUBLE = """#!/bin/sh
-echo "MUSTER_IMAGE=$MUSTER_IMAGE docker $*" >>"$TOLD"
+echo "MUSTER_IMAGE=$MUSTER_IMAGE docker $*" >>"$CALLS"
 """
 
 
@@ -89,9 +89,9 @@ def make_cluster(folder: Path, *arguments: str) -> tuple[subprocess.CompletedPro
         double.write_text(DOUBLE)
         double.chmod(0o755)
         (folder / "Makefile").symlink_to(REPOSITORY / "Makefile")
-    reported = folder / "told"
+    reported = folder / "calls"
     reported.write_text("")
-    env = {**os.environ, "PATH": f"{double.parent}:{os.environ['PATH']}", "TOLD": str(reported)}
+    env = {**os.environ, "PATH": f"{double.parent}:{os.environ['PATH']}", "CALLS": str(reported)}
     command = ["make", "cluster", *arguments]
     done = subprocess.run(command, cwd=folder, env=env, capture_output=True, text=True, timeout=120)
     return done, reported.read_text().splitlines()

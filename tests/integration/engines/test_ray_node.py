@@ -50,7 +50,7 @@ def pids(contract: NodeContract) -> list[int]:
     return found
 
 
-def test_a_stopped_node_leaves_nothing_and_names_a_process_that_can_not_be_killed(
+def test_a_stopped_node_leaves_nothing_and_names_a_process_that_can_t_be_killed(
     contract: NodeContract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("shared_store.process.node_processes.end_all", lambda find, strike: end_all(find, 0.5, strike))
@@ -70,7 +70,7 @@ def test_a_stopped_node_leaves_nothing_and_names_a_process_that_can_not_be_kille
 PRINT_ENVIRONMENT = "import os; print(*sorted(os.environ))"
 
 
-def test_a_node_has_of_its_machine_s_variables_what_programs_need_and_what_somebody_names(
+def test_a_node_has_of_its_machine_s_variables_what_programs_need_and_what_a_user_names(
     contract: NodeContract, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("HF_TOKEN", "WANDB_API_KEY", "KUBECONFIG", "RAY_JOB_ID", "NCCL_DEBUG"):

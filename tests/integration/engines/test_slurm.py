@@ -18,7 +18,7 @@ from orchestrator.engines.slurm.engine import SlurmEngine
 from orchestrator.engines.slurm.slurm_commands import SlurmJob, list_hosts
 from orchestrator.engines.slurm.states import waiting
 from orchestrator.engines.toolkit.statuses import status_of
-from tests.conftest import Serving, wait_for
+from tests.conftest import wait_for
 from tests.support.engines.sites import STUBBORN, WAIT
 from tests.support.engines.slurm_bench import SlurmBench, slurm_bench
 from tests.support.engines.slurm_cluster import GPUS, NODES
@@ -37,31 +37,6 @@ def test_hosts_have_slurm_s_resources_and_drained_ones_are_away(bench: SlurmBenc
         wait_for(lambda: "nodes that it needs are down" in status_of(bench.engine, handle)[0].words, 20, "it is queued")
         bench.engine.stop(handle, 0.0)
     finally:
-        bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
-
-
-def test_a_job_for_more_hosts_than_there_are_says_what_it_waits_for(bench: SlurmBench, tmp_path: Path) -> None:
-    spec = tmp_path / "job.yaml"
-    spec.write_text("name: large\nnodes: 3\ncommand: [sleep, '600']\nresources: {cpus: 0.5, memory: 64MiB}\n")
-    bench.cluster.run("scontrol", "update", "nodename=n2", "state=drain", "reason=test")
-    served = Serving(tmp_path / "home", "--engine", "slurm")
-    try:
-
-        def waits(reason: str) -> None:
-            wait_for(lambda: reason in served.detail("large")["statusReason"], 20, reason)
-
-        done = served.muster("submit", str(spec))
-        assert done.returncode == 0, done.stderr
-        waits("Slurm: nodes that it needs are down, drained or reserved")
-        served.muster("stop", "large")
-        done = served.muster("submit", str(spec), "--set", "nodes=4")
-        assert done.returncode == 0, done.stderr
-        waits("needs 4 hosts, one for each node; there are 3")
-        refused = served.muster("submit", str(spec), "--set", "resources.cpus=9")
-        assert refused.returncode == 2 and "the largest host has 4 CPUs" in refused.stderr, refused.stderr
-        assert served.muster("stop", "large").returncode == 0
-    finally:
-        served.close()
         bench.cluster.run("scontrol", "update", "nodename=n2", "state=resume")
 
 

@@ -1,4 +1,4 @@
-"""A volume that runs full: nothing new starts or is accepted, what runs can be stopped, all is said, and all goes on with room."""
+"""A volume that runs full: nothing new starts or is accepted, what runs can be stopped, all is reported, and all goes on with room."""
 
 from __future__ import annotations
 

@@ -8,15 +8,12 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from pathlib import Path
-from threading import Event
 from typing import Any
 
 import httpx
 import pytest
 
-from orchestrator.cli.progress import follow
 from orchestrator.client import Client
-from orchestrator.control.run_store import RunStore
 from orchestrator.control.store_calls import THREADS
 from orchestrator.domain.errors import ApiError
 from orchestrator.server import Server
@@ -25,10 +22,10 @@ from orchestrator.spec.model import validate
 from shared_store.volume.checkpoints import list_checkpoints
 from shared_store.volume.initial_weights import WeightsCopy
 from shared_store.volume.layout import Run, Store
-from tests.conftest import call_muster, submit_gang
+from tests.conftest import submit_gang
 from tests.support.definitions import container, multinode
 from tests.support.faults.stalled import stalled
-from tests.support.orchestrator.jobs import FOREVER, await_status, detail
+from tests.support.orchestrator.jobs import FOREVER, await_status
 from tests.support.orchestrator.trained import add_checkpoint, add_run
 from tests.support.waiting import wait_for
 
@@ -150,14 +147,6 @@ def test_what_continues_a_run_reads_it_before_it_holds_the_database(server: Serv
         assert [each.result().status_code for each in sent[1:]] == [200, 200]
 
 
-def test_a_store_whose_volume_is_known_to_be_silent_is_not_even_tried(server: Server) -> None:
-    with stalled(server.store.path):
-        wait_for(lambda: server.controller.access.disk.unavailable("store"), 60, "that the volume is silent")
-        answer = requested(server, "/api/runs")
-        assert answer.status_code == 503 and "has not answered since" in answer.json()["message"]
-        assert requested(server, "/api/jobs").status_code == 200
-
-
 @pytest.mark.parametrize("existing", ["nothing", "another store"])
 def test_while_the_store_is_not_there_what_needs_it_is_refused_with_the_reason(
     server: Server, tmp_path: Path, existing: str
@@ -211,7 +200,7 @@ def test_a_download_whose_file_stalls_is_cut_off_and_keeps_nobody_waiting(server
     wait_for(lambda: not is_open(exports / "policy.bin"), 20, "that the file is closed")
 
 
-def test_pages_that_wait_for_the_store_say_so_and_the_others_stay_live(server: Server) -> None:
+def test_pages_that_wait_for_the_store_report_it_and_the_others_stay_live(server: Server) -> None:
     with Client(server.url) as client, ThreadPoolExecutor(40) as threads:
         job = submit_gang(client, CHATTING, env={"MUSTER_RUN": "running"})
         await_status(client, job, "RUNNING")
@@ -285,31 +274,6 @@ def test_a_teacher_whose_publication_hangs_is_taken_back_when_the_store_answers_
         job = client.batch("SubmitJob", **pupil)["jobId"]
         run = server.store.run(client.batch("DescribeJobs", jobs=[job])["jobs"][0]["jobName"] + f"-{job[:8]}")
         assert [each.iteration for each in list_checkpoints(run.teacher("taught"))] == [3]
-
-
-def test_who_follows_a_job_waits_while_the_store_is_slow_to_begin_its_run(
-    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    answered, claim = Event(), RunStore.claim
-    monkeypatch.setattr(RunStore, "claim", lambda *arguments: (answered.wait(60), claim(*arguments))[1])
-    printed = ""
-
-    def shows_a_start() -> bool:
-        nonlocal printed
-        printed += capsys.readouterr().out
-        return "STARTING" in printed or followed.done()
-
-    with Client(server.url) as client, ThreadPoolExecutor(1) as threads:
-        job = client.batch("SubmitJob", **distilling(client))["jobId"]
-        followed = threads.submit(follow, client, job)
-        wait_for(shows_a_start, 30, "a start that is shown")
-        assert [each["epoch"] for each in detail(client, job)["attempts"]] == [0] and not followed.done()
-        shown = call_muster("show", job, home=tmp_path / "home")
-        assert shown.returncode == 0 and "None" not in shown.stdout, "its log is not there yet"
-        answered.set()
-        await_status(client, job, "RUNNING")
-        client.batch("TerminateJob", jobId=job, reason="enough")
-        assert followed.result(60) == 1
 
 
 def test_copies_of_teachers_that_hang_leave_threads_for_other_requests(server: Server) -> None:

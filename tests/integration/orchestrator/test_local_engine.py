@@ -50,7 +50,7 @@ class LocalBench(Bench):
     def environments(self, gang: Gang) -> list[dict[str, str]]:
         """What a gang that prints its environment as JSON printed, by node index."""
         found: dict[int, dict[str, str]] = {node: json.loads(text) for node, text in self.printed(gang.attempt)}
-        return [found[index] for index in range(len(gang.commands))]
+        return [found[index] for index in range(len(gang.nodes))]
 
     def close(self) -> None:
         """End all that is left, without the engine: a test may have broken it."""

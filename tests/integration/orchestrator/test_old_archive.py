@@ -1,6 +1,6 @@
 """A home of an older commit under today's controller: jobs, queues, definitions, runs, models, keys and webhooks are what they were.
 
-``tests/support/former/make.py`` says how the home was made. The machine of this controller is too small for the jobs that were
+``tests/data/former/README.md`` says how the home was made. The machine of this controller is too small for the jobs that were
 running or waiting: that they go on is tested with real ranks, in ``tests/training/e2e/test_old_runs.py``.
 """
 

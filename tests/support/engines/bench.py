@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import uuid
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.engines.api import Engine, Gang, Handle, NodeStatus, NotYet
+from orchestrator.engines.api import Engine, Gang, GangNode, Handle, NodeStatus, NotYet
 from orchestrator.engines.testing import rigs
 from orchestrator.engines.toolkit.statuses import status_of
 from shared_store.volume.epoch import raise_epoch, read_epoch
@@ -21,14 +22,20 @@ from tests.support.engines.sites import WAIT
 from tests.support.processes import processes_of
 from tests.support.waiting import wait_for
 
+_OF_NODES = {"commands": "command", "environments": "environment", "placements": "placement"}
+_OF_NODES |= {"containers": "container", "ranks": "ranks"}
+
 
 def make_gang(store: Path, script: str = WAIT, nodes: int = 2, **changes: Any) -> Gang:
-    """A gang whose nodes run ``sh -c script``, with ``changes``."""
-    attempt = changes.get("attempt", 1)
+    """A gang whose nodes run ``sh -c script``, with ``changes``; :data:`_OF_NODES` are lists with an entry for each node."""
+    attempt, command, environment = changes.get("attempt", 1), ["sh", "-c", script], {"GREETING": "hello"}
+    lists: dict[str, Sequence[Any]] = {"command": [command] * nodes, "environment": [environment] * nodes}
+    lists["placement"] = [Placement("localhost", (), 0.5, 64)] * nodes
+    lists |= {name: changes.pop(plural) for plural, name in _OF_NODES.items() if plural in changes}
     gang = rigs.make_gang("job", str(store), nodes, "localhost", ["sh", "-c", script])
     facts: dict[str, Any] = {"attempt": attempt, "epoch": attempt, "run": "run", "compute_environment": "here"}
-    facts |= {"environments": [{"GREETING": "hello"}] * nodes, "grace": 5.0, "is_native": False}
-    facts["placements"] = [Placement("localhost", (), 0.5, 64)] * nodes
+    facts |= {"grace": 5.0, "is_native": False}
+    facts["nodes"] = [GangNode(**dict(zip(lists, each, strict=True))) for each in zip(*lists.values(), strict=True)]
     return replace(gang, **{**facts, **changes})
 
 
@@ -86,14 +93,14 @@ class Bench(ABC):
         return handle
 
     def ready(self, gang: Gang) -> Handle:
-        """Launch the gang, if that was not done, and wait until every node has said ``ready``; returns the handle."""
+        """Launch the gang, if that was not done, and wait until every node has printed ``ready``; returns the handle."""
         handle = self.launch(gang)
 
         def output() -> bool:
             status_of(self.engine, handle)  # as a controller does all the time
-            return self.log(gang.attempt, job=gang.job, run=gang.run).count("ready") == len(gang.commands)
+            return self.log(gang.attempt, job=gang.job, run=gang.run).count("ready") == len(gang.nodes)
 
-        wait_for(output, 60, f"{len(gang.commands)} ready nodes")
+        wait_for(output, 60, f"{len(gang.nodes)} ready nodes")
         return handle
 
     def ended(self, handle: Handle, engine: Engine | None = None) -> list[NodeStatus]:

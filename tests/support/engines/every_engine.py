@@ -15,9 +15,9 @@ from tests.support.waiting import wait_for
 
 CONTRACT = """python3 - <<'PYTHON'
 import json, os
-told = {name: value for name, value in os.environ.items() if name.startswith(("AWS_BATCH", "MUSTER_", "MASTER_", "NODE_", "NNODES"))}
-told |= {name: os.environ[name] for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "GREETING", "CUDA_VISIBLE_DEVICES") if name in os.environ}
-print(json.dumps(told))
+found = {name: value for name, value in os.environ.items() if name.startswith(("AWS_BATCH", "MUSTER_", "MASTER_", "NODE_", "NNODES"))}
+found |= {name: os.environ[name] for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK", "GREETING", "CUDA_VISIBLE_DEVICES") if name in os.environ}
+print(json.dumps(found))
 PYTHON
 for i in $(seq 200); do echo "line $i of $RANK"; done
 """
@@ -79,7 +79,7 @@ class EveryEngine:
         assert site.printed(job) == ["one"] and detail["attempts"][0]["nodes"][0]["exitCode"] == 7
         await_job_end(job)
 
-    def test_where_the_outcome_can_not_be_written_the_exit_code_counts_that_the_engine_saw(self, site: Site) -> None:
+    def test_where_the_outcome_can_t_be_written_the_exit_code_counts_that_the_engine_saw(self, site: Site) -> None:
         if site.engine == "aws-batch":
             pytest.skip("there the engine writes the outcome, from AWS's answer")
         link = "ln -s /tmp $MUSTER_STORE/runs/$MUSTER_RUN/outcomes"  # which is never followed

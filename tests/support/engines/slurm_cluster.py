@@ -19,6 +19,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.hosts import free_ports
 from tests.support.processes import command, environment, processes_running, signal_all
 from tests.support.waiting import PATIENCE, wait_for
 
@@ -70,21 +71,6 @@ PartitionName=closed Nodes=ALL MaxTime=INFINITE State=DOWN
 """
 
 
-def _free_ports(count: int) -> list[int]:
-    """Ports that nobody has just now, below those that the kernel hands out: other tests' connections do not take them."""
-    found: list[int] = []
-    candidate = 20000 + os.getpid() * 16 % 12000
-    while len(found) < count:
-        candidate += 1
-        with socket.socket() as probe:
-            try:
-                probe.bind(("", candidate))
-                found.append(candidate)
-            except OSError:
-                continue
-    return found
-
-
 class SlurmCluster:
     """The daemons, and where their configuration is."""
 
@@ -94,7 +80,7 @@ class SlurmCluster:
         self.daemons: dict[str, subprocess.Popen[bytes]] = {}
         (home / "state").mkdir(parents=True)
         (home / "devices").mkdir()
-        ports = _free_ports(1 + len(NODES))
+        ports = free_ports(1 + len(NODES))
         octet = os.getpid() % 250 + 1
         self.addresses = {name: f"127.{octet}.{ports[0] % 250 + 1}.{number}" for number, name in enumerate(NODES, 1)}
         nodes = [

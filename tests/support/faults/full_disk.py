@@ -126,7 +126,7 @@ def _taken_on(client: Client) -> str | None:
 
 
 def _submit(client: Client, count: int, done: Counter[str]) -> list[str]:
-    """Jobs that were taken on though there is no room; a refusal has a reason and is no fault of the server."""
+    """Jobs that were taken on though there is no room; a refusal has a reason and is not a fault of the server."""
     taken = []
     for _ in range(count):
         try:

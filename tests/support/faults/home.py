@@ -39,7 +39,7 @@ class Home:
 
     @property
     def errors(self) -> Path:
-        """What the controllers of this home said on stderr, all of them."""
+        """What the controllers of this home wrote to stderr, all of them."""
         return self.path / "controllers.err"
 
     @property
@@ -102,7 +102,7 @@ class Home:
     # -- the command --------------------------------------------------------------------------------------------------
 
     def command(self, *arguments: str) -> tuple[dict[str, Any] | None, str]:
-        """``muster ARGUMENTS --json``: what it printed (None where it refused) and what it said on stderr."""
+        """``muster ARGUMENTS --json``: what it printed (None where it refused) and what it wrote to stderr."""
         self.serve()
         done = run_muster(*arguments, "--json", home=self.path, timeout=60)
         return (json.loads(done.stdout) if done.returncode == 0 else None), done.stderr.strip()
@@ -131,11 +131,10 @@ class Home:
 
 
 def reached(run: Run, epoch: int) -> int:
-    """The last iteration that the attempt of ``epoch`` has told of; 0 before its first."""
+    """The last iteration that the attempt of ``epoch`` has reported; 0 before its first."""
     try:
         with open(run.metrics / f"metrics-e{epoch}.jsonl", "rb") as file:
-            file.seek(0, os.SEEK_END)
-            file.seek(max(0, file.tell() - 4096))
+            file.seek(max(0, file.seek(0, os.SEEK_END) - 4096))
             lines = file.read().split(b"\n")[:-1]
         return int(json.loads(lines[-1]).get("iteration", 0)) if lines else 0
     except (OSError, ValueError):

@@ -12,7 +12,6 @@ TRAINING: dict[str, Any] = {
     "checkpoint": {"every": 10, "keep": 10},
     "retry": {"attempts": 3},
 }
-COMMAND: dict[str, Any] = {"resources": {"cpus": 0.5, "memory": "64MiB"}, "retry": {"attempts": 1}}
 
 
 def _small(name: str, train: dict[str, Any]) -> dict[str, Any]:

@@ -45,7 +45,7 @@ class SimulatedEngine:
 
     def plan(self, gang: Gang) -> Plan[Gang]:
         self._world.invariants.check_request(gang)
-        addresses = [f"10.0.0.{index + 1}" for index in range(len(gang.commands))]
+        addresses = [f"10.0.0.{index + 1}" for index in range(len(gang.nodes))]
         return Plan(gang, node_plans(gang, addresses, 29500), gang)
 
     def launch(self, plan: Plan[Gang]) -> Handle:

@@ -1,6 +1,6 @@
 """Runs and jobs that an older commit left behind, under today's code: they go on, to the same bits, with nothing lost.
 
-``tests/support/former/make.py`` says how the home was made. Which bits a training computes depends on the processor and the libraries, too:
+``tests/data/former/README.md`` says how the home was made. Which bits a training computes depends on the processor and the libraries, too:
 on another kind than the archive's a resumed run is compared with one that today's code computed straight, and a warning says so.
 """
 

@@ -68,7 +68,7 @@ def test_no_group_is_left_when_the_supervisor_has_ended(group: str, end: str) ->
     # the fixture looks
 
 
-def test_a_group_that_can_t_be_made_is_said_and_limits_nothing(tmp_path: Path) -> None:
+def test_a_group_that_can_t_be_made_is_reported_and_limits_nothing(tmp_path: Path) -> None:
     facts = {"node_index": 0, "node_count": 1, "main_index": 0, "master_address": "", "master_port": 1, "epoch": 1}
     contract = NodeContract(job="j", attempt=1, run="r", store="s", job_epoch=1, **facts)
     limit = MemoryLimit(contract)

@@ -171,7 +171,7 @@ def test_a_killed_supervisor_s_temporary_directory_is_removed_and_no_other(pids:
     other.rmdir()
 
 
-def test_a_shim_is_told_apart_from_other_commands_by_its_command_line() -> None:
+def test_a_shim_is_distinguished_from_other_commands_by_its_command_line() -> None:
     line = [word.encode() for word in shimmed(["python", "-m", "worker.supervisor"], "/sys/fs/cgroup/x")]
     assert group_of(line) == "/sys/fs/cgroup/x"
     assert group_of([word.encode() for word in shimmed(["python"])]) == ""
@@ -196,7 +196,7 @@ def test_an_unkillable_process_is_named_and_waited_for(pids: Path, monkeypatch: 
     message = shim.stderr.read()
     wait = "in an uninterruptible wait"
     assert message.startswith(f"muster: SIGKILL does not end process {stubborn} (sleep), state D: {wait}")
-    assert message.count("\n") == 1, "said once"
+    assert message.count("\n") == 1, "reported once"
 
 
 CHAIN = """

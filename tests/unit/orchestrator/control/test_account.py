@@ -12,7 +12,6 @@ from orchestrator.domain.errors import UsageError
 from orchestrator.persistence.batch_models import Job, JobDefinition, JobQueue
 from orchestrator.persistence.own_models import LogGroup
 from orchestrator.persistence.session import Database
-from orchestrator.services import arns
 from tests.support.orchestrator.rows import job
 
 
@@ -41,26 +40,6 @@ def test_a_malformed_account_settles_nothing(database: Database, account: str) -
     with pytest.raises(UsageError, match="expected 12 digits"):
         start(database, account)
     assert start(database, "123456789012").id == "123456789012"
-
-
-def test_a_region_that_aws_does_not_have_settles_nothing(database: Database) -> None:
-    with pytest.raises(UsageError, match="expected a region of AWS"):
-        start(database, None, "middle-earth")
-    assert start(database) == DEFAULT
-
-
-def test_every_arn_has_the_account_the_region_and_its_partition() -> None:
-    try:
-        arns.settle(Account("123456789012", "cn-north-1", "aws-cn"))
-        batch = "arn:aws-cn:batch:cn-north-1:123456789012:"
-        assert arns.job_arn("j") == f"{batch}job/j" and arns.plain_name(f"{batch}job-queue/q", "job-queue") == "q"
-        assert arns.ecs_arn("cluster", "c") == "arn:aws-cn:ecs:cn-north-1:123456789012:cluster/AWSBatch-c"
-        assert arns.iam_arn("role/r") == "arn:aws-cn:iam::123456789012:role/r"
-        assert arns.log_group_arn("/g") == "arn:aws-cn:logs:cn-north-1:123456789012:log-group:/g"
-        with pytest.raises(arns.ClientError, match="not an ARN of this controller"):
-            arns.plain_name("arn:aws:batch:us-east-1:000000000000:job-queue/q", "job-queue")
-    finally:
-        arns.settle(DEFAULT)
 
 
 def temporary(database: Database) -> Account:

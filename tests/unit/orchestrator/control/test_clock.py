@@ -2,22 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
-from pathlib import Path
 
-import pytest
 from sqlalchemy.orm import Session
 
-from orchestrator.client import Client
 from orchestrator.control.clock import Clock
 from orchestrator.control.usage import usage_at
 from orchestrator.persistence.own_models import ShareUsage
 from orchestrator.persistence.session import Database
-from orchestrator.server import Server
-from tests.conftest import submit_gang
-from tests.support.orchestrator.jobs import FOREVER, await_status, detail
-from tests.support.processes import end_all
 
 HOUR = 3600
 
@@ -90,44 +82,3 @@ def test_a_clock_that_is_behind_does_not_multiply_the_use_of_a_share(session: Se
     session.add(ShareUsage(queue="default", share="red", seconds=100.0, as_of=10**12))
     session.flush()
     assert usage_at(session, 10**12 - 86_400_000, {"default": 60}, []) == {("default", "red"): 100.0}
-
-
-def test_a_step_of_the_clock_ends_no_job_even_across_a_restart_of_the_controller(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    real, step = time.time, [0.0]
-    monkeypatch.setattr(time, "time", lambda: real() + step[0])
-    server = Server(tmp_path, port=0, cpus=2, retention=HOUR)
-    server.start()
-    try:
-        with Client(server.url) as client:
-            done = submit_gang(client, "print('here')")
-            await_status(client, done, "SUCCEEDED")
-            job = submit_gang(client, FOREVER, timeout=HOUR, attempts=2)
-            await_status(client, job, "RUNNING")
-            for seconds in (2 * HOUR, -24 * HOUR):
-                step[0] = seconds
-                # it comes after the step, is looked at after it, and is over after that
-                await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
-                assert detail(client, job)["status"] == "RUNNING"
-                assert detail(client, done)["status"] == "SUCCEEDED", "its history is kept for an hour"
-        server.close()
-        step[0] = 3 * HOUR
-        server = Server(tmp_path, port=0, cpus=2, retention=HOUR)
-        server.start()
-        with Client(server.url) as client:
-            await_status(client, submit_gang(client, "print('here')"), "SUCCEEDED")
-            assert detail(client, job)["status"] == "RUNNING"
-            step[0] = -24 * HOUR
-            client.batch("TerminateJob", jobId=job, reason="enough")
-            ended = await_status(client, job, "FAILED")
-            assert ended["statusReason"] == "enough" and len(ended["attempts"]) == 1
-            [attempt] = ended["attempts"]
-            assert attempt["stoppedAt"] >= attempt["startedAt"] and ended["stoppedAt"] >= ended["startedAt"]
-            assert 0 < attempt["cpuSeconds"] < 600
-    finally:
-        server.close()
-        end_all(tmp_path)
-    steps = [record.getMessage() for record in caplog.records if "the wall clock moved by" in record.getMessage()]
-    # another controller of this process sees the same steps
-    assert list(dict.fromkeys(step.split()[5] for step in steps))[:3] == ["+7200", "-93600", "+97200"], steps

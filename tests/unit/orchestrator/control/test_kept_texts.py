@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -13,11 +12,9 @@ import pytest
 from orchestrator import machine
 from orchestrator.control import kept_texts
 from orchestrator.control.kept_texts import DAYS, KeptTexts, TextRefused
-from orchestrator.domain.errors import Unavailable
 from orchestrator.domain.job import Status
 from orchestrator.persistence import batch_models
 from orchestrator.persistence.batch_models import Job, JobDefinition
-from orchestrator.persistence.own_models import KeptText
 from orchestrator.persistence.session import Database
 from orchestrator.spec.compile import compile_definition, long_texts
 from orchestrator.spec.model import validate
@@ -54,13 +51,6 @@ def later(monkeypatch: pytest.MonkeyPatch, days: float) -> None:
 
 def naming(digest: str) -> dict[str, Any]:
     return {"environment": [{"name": "MUSTER_SPEC", "value": f'{{"a": {{"file": "a.py", "sha256": "{digest}"}}}}'}]}
-
-
-def test_a_text_is_kept_under_its_digest_by_many_senders_at_once(texts: KeptTexts, store: Store) -> None:
-    senders = [f"key {number % 3}" for number in range(24)]
-    with ThreadPoolExecutor(8) as threads:
-        assert set(threads.map(lambda owner: texts.keep(TEXT.encode(), owner), senders)) == {DIGEST}
-    assert kept(store) == [DIGEST] and (store.texts / "here" / DIGEST).read_text() == TEXT
 
 
 def test_a_text_that_nothing_names_goes_after_some_days_and_each_upload_prolongs_that(
@@ -152,7 +142,7 @@ def test_leftovers_of_a_killed_upload_go_and_other_controllers_texts_stay(texts:
     assert kept(store) == [DIGEST] and (store.texts / "there" / DIGEST).exists()
 
 
-def test_what_is_no_text_and_what_is_too_long_is_refused(texts: KeptTexts, store: Store) -> None:
+def test_what_is_not_a_text_and_what_is_too_long_is_refused(texts: KeptTexts, store: Store) -> None:
     assert refusal(texts.keep, b"\xff\xfe", "key a", error=TextRefused) == "it is not a text (UTF-8)"
     too_long = refusal(texts.keep, b"x" * (LARGEST + 1), "key a", error=TextRefused)
     assert too_long == "the text has 1,048,577 bytes, and may have 1,048,576; shorten it"
@@ -171,23 +161,3 @@ def test_a_key_may_upload_so_much_a_day_and_the_same_again_counts_once(
     texts.keep(b"c", "key b")
     later(monkeypatch, 1.01)
     texts.keep(b"d", "key a")
-
-
-def test_a_full_store_keeps_nothing_and_says_so(
-    database: Database, store: Store, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    short = KeptTexts(database, store, "here", threading.Lock(), lambda: "the volume of the store has 1 MB free")
-    refused = refusal(short.keep, TEXT.encode(), "key a", error=Unavailable)
-    assert refused == "the volume of the store has 1 MB free; the text is not kept"
-
-    def full(descriptor: int) -> None:
-        raise OSError(28, os.strerror(28))
-
-    texts = KeptTexts(database, store, "here", threading.Lock())
-    monkeypatch.setattr(os, "fsync", full)
-    refused = refusal(texts.keep, TEXT.encode(), "key a", error=Unavailable)
-    assert refused == f"the text can't be kept in {store.texts} (No space left on device)"
-    monkeypatch.undo()
-    assert kept(store) == []
-    with database.session() as session:
-        assert session.get(KeptText, DIGEST) is None

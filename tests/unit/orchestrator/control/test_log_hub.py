@@ -143,21 +143,6 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return found
 
 
-def test_nodes_are_asked_to_push_and_a_line_reaches_all_followers_without_a_file(
-    world: World, looks: Counter[str]
-) -> None:
-    everyone = [world.follow() for _ in range(20)]
-    world.write("before", push=False)
-    wait_for(lambda: all(has(each, "before") for each in everyone))
-    wait_for(lambda: world.requested["job", 1])
-    world.settle()
-    looks.clear()
-    for number in range(50):
-        world.write(f"line {number}", (1, number % 2))
-    wait_for(lambda: all(has(each, *(f"line {number}" for number in range(50))) for each in everyone))
-    assert not looks
-
-
 def test_a_lost_push_costs_one_look_for_all_followers(world: World, looks: Counter[str]) -> None:
     everyone = [world.follow() for _ in range(20)]
     world.settle()
@@ -168,13 +153,6 @@ def test_a_lost_push_costs_one_look_for_all_followers(world: World, looks: Count
     world.state()
     wait_for(lambda: all(has(each, "lost") for each in everyone))
     assert looks["hub"] <= 2 and not looks["followers"]
-
-
-def test_without_a_bus_one_reader_serves_all(world: World) -> None:
-    everyone = [world.follow() for _ in range(5)]
-    for number in range(10):
-        world.write(f"line {number}", push=False)
-        wait_for(lambda number=number: all(has(each, f"line {number}") for each in everyone))
 
 
 def test_a_supervisor_that_knows_no_pushes_any_more_is_read_and_asked_again(
@@ -204,7 +182,7 @@ def test_followers_end_with_the_job_and_have_its_last_line_though_its_push_was_l
     assert not world.hub._followed, "nothing is kept for nobody"
 
 
-def test_followers_end_though_no_commit_told_of_the_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_followers_end_though_no_commit_reported_the_end(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(log_hub, "_ROWS", 0.0)
     pieces = world.follow()
     world.settle()
@@ -256,7 +234,7 @@ def test_while_the_store_is_away_lines_come_from_memory_and_nothing_is_lost(worl
     wait_for(lambda: has(pieces, "before", "pushed meanwhile", "lost meanwhile"))
 
 
-def test_a_log_that_can_not_be_read_ends_its_stream_with_the_reason(
+def test_a_log_that_can_t_be_read_ends_its_stream_with_the_reason(
     world: World, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> list[int]:
@@ -331,25 +309,3 @@ def test_looks_become_rare_while_they_find_nothing_and_frequent_again_with_a_cha
     world.hub._followed["job"] = job
     world.write("pushed")
     assert looks_in(0.1) >= 1
-
-
-def test_what_happens_during_a_look_has_the_next_one_come_soon(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    job = log_hub._Followed(world.run, "job")
-    job.found -= 1000.0
-
-    def look() -> bool:
-        job.look_soon()
-        return False
-
-    monkeypatch.setattr(job.logs, "look", look)
-    world.hub._look(job)
-    wait_for(lambda: not job.is_polled)
-    assert job.pause == log_hub._LOOK
-
-
-def test_an_idle_hub_has_no_thread_and_the_next_follower_starts_it_again(world: World) -> None:
-    for _ in range(2):
-        with world.hub.follow(world.run, "job", Waker()):
-            assert world.hub._thread is not None
-        world.hub.changed(["job"])
-        wait_for(lambda: world.hub._thread is None)

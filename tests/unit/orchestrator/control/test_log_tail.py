@@ -23,7 +23,7 @@ LOG = (1, 0)
 
 
 class Followed:
-    """A job of one node that somebody follows: its log, the messages of its node, and one reader."""
+    """A job of one node that is followed: its log, the messages of its node, and one reader."""
 
     def __init__(self, directory: Path, limit: int = 1 << 30) -> None:
         self.run = Run(directory)
@@ -82,29 +82,6 @@ def job(tmp_path: Path) -> Followed:
     return Followed(tmp_path / "run")
 
 
-def no_look(*_: object) -> None:
-    raise AssertionError("a file was looked at")
-
-
-def test_what_is_pushed_is_read_without_a_look_at_a_file(job: Followed, monkeypatch: pytest.MonkeyPatch) -> None:
-    job.state()
-    monkeypatch.setattr(log_tail, "read_log", no_look)
-    monkeypatch.setattr("shared_store.volume.log_files.read_log", no_look)
-    for number in range(100):
-        job.write(f"line {number}")
-        assert not job.state() and job.logs.delivers()
-        assert job.read(memory_alone=True)[-1] == f"line {number}"
-    assert len(job.seen) == 100
-
-
-def test_a_lost_push_is_noticed_by_the_next_word_of_the_node_and_filled_from_the_file(job: Followed) -> None:
-    job.write("first")
-    job.write("lost", push=False)
-    assert job.state() and not job.logs.delivers()
-    assert job.logs.look() and job.read(memory_alone=True) == ["first", "lost"]
-    assert job.logs.delivers() and not job.logs.look(), "there is nothing to look for any more"
-
-
 def test_a_push_that_comes_before_another_waits_for_it_and_doubles_change_nothing(job: Followed) -> None:
     for text in "abc":
         job.write(text, push=False)
@@ -117,19 +94,6 @@ def test_a_push_that_comes_before_another_waits_for_it_and_doubles_change_nothin
     assert job.read(memory_alone=True) == ["a", "b", "c"]
 
 
-def test_a_volume_that_shows_a_log_late_neither_hides_nor_doubles_a_line(job: Followed) -> None:
-    job.write("seen")
-    job.write("not in the file yet", visible=False)
-    job.write("lost", push=False, visible=False)
-    assert job.state()
-    job.logs.look()
-    assert job.read() == ["seen", "not in the file yet"]
-    assert job.view.poll() == [], "the file is shorter than what was read, and was not replaced"
-    job.show()
-    job.logs.look()
-    assert job.read() == ["seen", "not in the file yet", "lost"]
-
-
 def test_a_log_that_was_truncated_is_read_from_its_new_beginning(job: Followed) -> None:
     job.write("one", "two")
     job.read()
@@ -140,35 +104,10 @@ def test_a_log_that_was_truncated_is_read_from_its_new_beginning(job: Followed) 
     assert job.read() == ["one", "two", REPLACED, "three"]
 
 
-def test_a_node_that_does_not_push_is_looked_at_and_one_that_restarts_too(job: Followed) -> None:
-    assert not job.logs.delivers(), "it has not been heard"
-    job.write("polled", push=False)
-    assert job.logs.look() and job.read() == ["polled"]
-    job.state()
-    assert job.logs.delivers()
-    job.logs.state(LOG, None, False)  # its supervisor's successor does not know yet that somebody follows
-    assert not job.logs.delivers()
-    job.write("of the successor", push=False)
-    assert job.logs.look() and job.read() == ["polled", "of the successor"]
-
-
 def test_a_node_that_has_ended_needs_no_look_for_ever(job: Followed, monkeypatch: pytest.MonkeyPatch) -> None:
     job.write("last")
     job.state(is_whole=True)
     monkeypatch.setattr(log_tail, "FRESH", 0.0)
-    assert job.logs.delivers()
-
-
-def test_a_new_attempt_begins_with_its_own_log_and_the_last_lines_of_the_former_are_read(job: Followed) -> None:
-    job.write("first attempt")
-    job.write("lost at the end", push=False)
-    assert job.logs.note(2, 1) and not job.logs.note(2, 1)
-    writer = LogWriter(job.run.log("job", 2, 0))
-    writer.append(format_line(1_900_000_000.0, 0, "o", "second attempt").encode())
-    assert not job.logs.delivers()
-    job.logs.look()
-    assert job.read() == ["first attempt", "lost at the end", "second attempt"]
-    job.logs.state((2, 0), writer.end(), False)
     assert job.logs.delivers()
 
 
@@ -184,13 +123,6 @@ def test_memory_is_bounded_and_a_slow_reader_goes_on_in_the_files(job: Followed)
     assert job.state()
     job.logs.look()
     assert [int(each.split()[0]) for each in job.read()] == list(range(400))
-
-
-def test_more_than_one_look_reads_is_left_to_the_readers(job: Followed) -> None:
-    job.write(*(f"{number} " + "x" * 1000 for number in range(3000)), push=False)
-    job.state()
-    assert job.logs.look() and not job.logs._tails[LOG].data
-    assert [int(each.split()[0]) for each in job.read()] == list(range(3000))
 
 
 def test_a_reader_that_comes_too_late_hears_what_was_left_out(tmp_path: Path) -> None:

@@ -95,7 +95,7 @@ def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_witho
     gang = Gang()
     gang.look(ABSENT, ABSENT)
     body, future = gang.pool.calls.pop()
-    found = body()  # by now it has read that there is none
+    found = body()  # by now it has found none
     gang.write(0, 0)
     future.set_result(found)
     running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
@@ -122,12 +122,3 @@ def test_a_node_that_ends_while_outcomes_are_read_again_after_an_error_is_looked
     gang.pool.carry_out()
     first, second = gang.look(*both).ends
     assert (first.exit_code, second.exit_code) == (137, 0)
-
-
-def test_a_node_that_has_ended_without_an_outcome_was_killed() -> None:
-    gang = Gang()
-    running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
-    assert gang.look(*running).unread == ""
-    gang.pool.carry_out()
-    seen = gang.look(*running)
-    assert isinstance(seen, Observed) and seen.ends[0] is not None and seen.ends[0].exit_code == 137

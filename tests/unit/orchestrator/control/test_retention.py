@@ -61,29 +61,6 @@ def test_a_pass_takes_old_jobs_of_the_batch_api_with_their_runs_and_nothing_else
         assert sorted(session.scalars(select(Node.job_id))) == sorted(session.scalars(select(Attempt.job_id)))
 
 
-def test_a_dry_run_tells_what_would_go_and_how_much_and_takes_nothing(world: World) -> None:
-    world.ended("old")
-    world.ended("kept")
-    contents.archive(world.store.run("kept"), "key a")
-    looks, following = world.step(take=False)
-    assert following is None and world.jobs() == ["kept", "old"] and world.runs() == ["kept", "old"]
-    found = {each["run"]: each for each in looks}
-    assert (found["old"]["jobs"], found["old"]["whole"], found["old"]["files"]) == (["old"], True, 3)
-    assert found["old"]["bytes"] > 1000 and found["old"]["kept"] == []
-    assert (found["kept"]["jobs"], found["kept"]["kept"]) == ([], ["it is archived (by key a)"])
-
-
-def test_results_keep_the_run_and_its_logs_go_with_the_job(world: World) -> None:
-    world.ended("old")
-    (world.store.run("old").path / "results.csv").write_text("1,2")
-    world.retention().take_all()
-    run = world.store.run("old").path
-    assert world.jobs() == [] and sorted(os.listdir(run)) == ["logs", "outcomes", "results.csv", "run.json"]
-    assert os.listdir(run / "logs") == os.listdir(run / "outcomes") == []
-    with world.database.session() as session:
-        assert session.scalars(select(RunRecord.name)).all() == ["old"], "it still has its owner"
-
-
 @pytest.mark.parametrize(
     ("make", "reason"),
     [
@@ -125,13 +102,6 @@ def test_a_job_that_uses_a_run_is_one_of_its_open_jobs(world: World) -> None:
     assert world.retention().open_job("old") is None
     world.add(job("reader", status="RUNNABLE"), RunUse(job_id="reader", run="old"))
     assert world.retention().open_job("old") == "reader"
-
-
-def test_a_reader_that_has_ended_keeps_nothing(world: World) -> None:
-    world.ended("old")
-    world.add(job("reads", status="FAILED", stopped_at=now()), RunUse(job_id="reads", run="old"))
-    world.retention().take_all()
-    assert world.jobs() == ["reads"] and world.runs() == []
 
 
 def test_the_jobs_of_an_array_go_when_all_of_them_are_old_enough(world: World) -> None:
@@ -373,14 +343,3 @@ def test_definitions_go_with_their_last_job_where_no_user_needs_them(world: Worl
     with world.database.session() as session:
         left = [(each.name, each.revision) for each in session.scalars(select(JobDefinition))]
     assert sorted(left) == [("client", 2), ("client", 3), ("used", 1)], "no number of a client's is given twice"
-
-
-def test_a_run_is_deleted_whole_and_its_jobs_stay_in_the_history(world: World) -> None:
-    world.ended("old", stopped_at=now(), from_yaml=True)
-    (world.store.run("old").path / "results.csv").write_text("1")
-    deleted = world.retention().delete("old")
-    assert deleted["files"] == 4 and world.runs() == [] and world.trashed() == []
-    assert world.jobs() == ["old"]
-    with world.database.session() as session:
-        assert session.get(RunRecord, "old") is None, "a new run of the name has an owner of its own"
-    assert world.retention().delete("old")["files"] == 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +12,6 @@ from orchestrator.control.peers import Peers
 from orchestrator.control.retention import Retention, RunNeeded
 from orchestrator.control.run_users import RunInUse
 from orchestrator.persistence.batch_models import Dependency
-from orchestrator.services.context import using
 from shared_store.volume import contents, epoch, trash
 from shared_store.volume.epoch import Claim
 from shared_store.volume.layout import Run, Store
@@ -154,20 +152,3 @@ def test_a_run_that_changes_while_a_person_has_it_deleted_stays(world: World, mo
     with pytest.raises(RunNeeded, match="run old has just changed, and nothing of it is deleted; try again"):
         world.retention().delete("old")
     assert world.runs() == ["old"] and run.log("old", 1, 0).is_file()
-
-
-def test_what_needs_runs_is_looked_for_again_before_a_run_that_was_cited_can_be_taken(
-    world: World, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    retention, taken = world.retention(), list[bool]()
-    refresh = retention.stored.refresh
-
-    def polled() -> None:
-        taken.append(world.users.take("old"))
-        refresh()
-
-    monkeypatch.setattr(retention.stored, "refresh", polled)
-    controller: Any = SimpleNamespace(retention=retention, access=SimpleNamespace(users=world.users))
-    with using(controller, "old"):
-        assert not taken
-    assert taken == [False] and world.users.take("old")

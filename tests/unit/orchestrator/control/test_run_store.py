@@ -36,19 +36,6 @@ def attempts(tmp_path: Path) -> Attempts:
     return Attempts(tmp_path)
 
 
-@pytest.mark.parametrize("late", [True, False])
-def test_a_claim_that_lands_when_its_attempt_is_closed_is_released(attempts: Attempts, late: bool) -> None:
-    attempts.claim(1, 0)
-    if not late:
-        attempts.pool.carry_out()  # it has landed, and nobody has collected it
-    attempts.close(1)
-    if late:
-        attempts.pool.carry_out()
-    assert read_epoch(attempts.run) == 1 and read_claim(attempts.run, 1) == Claim(attempts.runs.peers.id, "job", 1)
-    attempts.pool.carry_out()
-    assert read_claim(attempts.run, 1) is None and not attempts.pool.calls
-
-
 def test_the_next_attempt_on_a_run_waits_for_the_call_of_the_one_before(attempts: Attempts) -> None:
     attempts.claim(1, 0)
     attempts.errands.await_earlier("run")  # its own calls do not hold up an attempt

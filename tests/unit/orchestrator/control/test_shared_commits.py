@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import pytest
-from sqlalchemy import select
 
-from orchestrator.control.isolation import Isolation
 from orchestrator.domain.hosts import Host, Hosts
 from orchestrator.domain.job import Status
 from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.batch_models import Job, JobQueue, SchedulingPolicy
-from orchestrator.persistence.own_models import ShareUsage
+from orchestrator.persistence.batch_models import Job, JobQueue
 from orchestrator.persistence.session import Database, DatabaseError
 from tests.support.orchestrator.fake_controller import FakeController, properties
 from tests.support.waiting import wait_for
@@ -55,33 +51,6 @@ def test_what_a_request_changes_of_a_queue_counts_at_the_next_pass(bench: Bench)
         session.get_one(JobQueue, "urgent").compute_environments = ["fake"]
     queue.version += 1
     bench.ticks(are(bench, Status.RUNNING, "waits"))
-
-
-def test_jobs_of_one_share_that_end_together_share_their_commits(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
-    with bench.database.session() as session:
-        session.add(SchedulingPolicy(name="fair", fairshare={"shareDecaySeconds": 3600}))
-        session.get_one(JobQueue, "urgent").policy = "fair"
-    names = ["one", "two", "three"]
-    bench.submit(*names, queue="urgent", share="team", node_properties=properties(1))
-    bench.ticks(are(bench, Status.RUNNING, *names))
-    jobs, again, depth = Isolation._together, list[Sequence[str]](), [0]
-
-    def noted(self: Isolation, what: str, ids: Sequence[str], body: Any) -> Sequence[str]:
-        if depth[0]:
-            again.append(ids)
-        depth[0] += 1
-        try:
-            return jobs(self, what, ids, body)
-        finally:
-            depth[0] -= 1
-
-    monkeypatch.setattr(Isolation, "_together", noted)
-    for name in names:
-        bench.engine.cluster.end(f"{name}/1/1", 0, 0)
-    bench.ticks(are(bench, Status.SUCCEEDED, *names))
-    assert again == [], "done again, each by itself, since all of them together failed"
-    with bench.database.session() as session:
-        assert [(each.queue, each.share) for each in session.scalars(select(ShareUsage))] == [("urgent", "team")]
 
 
 def test_an_attempt_whose_end_was_committed_without_an_answer_is_forgotten(

@@ -4,22 +4,13 @@ from __future__ import annotations
 
 import logging
 import threading
-from contextlib import ExitStack
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from sqlalchemy.orm import Session
 
 from orchestrator.control import stops
 from orchestrator.control.stops import Stops
-from orchestrator.domain.hosts import Host, Hosts
-from orchestrator.domain.job import Status
-from orchestrator.engines.api import EngineError, GangStatus, Handle, read_handle
-from orchestrator.engines.testing.fake import FakeEngine
-from orchestrator.persistence.batch_models import Job
-from orchestrator.persistence.queries import ask_to_end
-from tests.support.orchestrator.fake_controller import FakeController
+from orchestrator.engines.api import GangStatus, Handle, read_handle
 from tests.support.waiting import wait_for
 
 
@@ -56,33 +47,3 @@ def test_a_stop_waits_for_those_of_its_own_engine_alone_and_its_reason_says_so(m
     finally:
         answers.set()
         requested.close()
-
-
-def test_why_a_gang_can_not_be_stopped_stays_its_reason_at_every_further_try(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(stops, "_AGAIN", 0.05)
-    tries, commit, reasons = list[str](), Session.commit, list[str | None]()
-
-    def deny(engine: FakeEngine, handle: Handle, grace: float) -> None:
-        tries.append(handle.gang)
-        raise EngineError("not authorized")
-
-    def noted(session: Session) -> None:
-        of_jobs = [each.status_reason for each in session if isinstance(each, Job) and each.status == Status.RUNNING]
-        commit(session)
-        reasons.extend(of_jobs)
-
-    monkeypatch.setattr(FakeEngine, "stop", deny)
-    with ExitStack() as stack:
-        bench = FakeController(tmp_path, FakeEngine(capacity=Hosts([Host("fake/host", 8.0, (), 8192)])), stack)
-        bench.submit("a")
-        bench.ticks(lambda: bench.job("a").status == Status.RUNNING)
-        with bench.database.session() as session:
-            ask_to_end(session, Job.id == "a", "enough")
-        monkeypatch.setattr(Session, "commit", noted)
-        bench.ticks(lambda: len(tries) > 3)
-    denied = "attempt 1 can't be stopped: not authorized; trying again"
-    assert "enough; its nodes are ending" in reasons
-    first = reasons.index(denied)
-    assert set(reasons[first:]) == {denied}

@@ -81,12 +81,6 @@ def test_the_store_of_an_older_muster_is_adopted_where_it_has_one_of_the_runs(ho
     assert home.start().identity == home.store.identity()
 
 
-def test_several_databases_may_have_one_store(home: Home, tmp_path: Path) -> None:
-    other = Home(tmp_path / "other", home.store.path)
-    assert home.start().identity == other.start().identity
-    assert home.start().problem() is None and other.start().problem() is None
-
-
 def test_a_store_that_can_t_be_read_is_one_line(home: Home) -> None:
     mine = home.start()
     (home.store.path / "store.json").write_text("{")

@@ -1,4 +1,4 @@
-"""The file of webhooks, which jobs each is told of, what of them, and the signature."""
+"""The file of webhooks, which jobs each gets, what of them, and the signature."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ SHORT = "whsec_c2hvcnQ="
         ({"statuses": ["DONE"]}, "chat.statuses"),
     ],
 )
-def test_a_mistake_is_told_in_one_line_without_a_secret(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
+def test_a_mistake_is_reported_in_one_line_without_a_secret(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
     path = write_webhooks(tmp_path / "hooks.json", chat={"url": URL, **changes})
     reported = refusal(read_webhooks, path, error=WebhooksError)
     assert words in reported and reported.startswith(f"{path}: ") and "\n" not in reported

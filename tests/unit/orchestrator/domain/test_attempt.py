@@ -56,7 +56,7 @@ def on_aws(state: AttemptState) -> AttemptState:
 
 
 def seen(*ends: NodeEnd | None, silences: Sequence[Silence | None] = (None, None), **facts: Any) -> Observed:
-    """A look at two nodes that run, where nothing else is said."""
+    """A look at two nodes that run, where nothing else is reported."""
     return Observed(T, ends or (None, None), silences, **facts)
 
 
@@ -172,7 +172,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
         [do.Decide(Verdict(Ending.FATAL, "Task failed to start", start_error="no such image")), do.WindUp()],
     ),
     "before its launch nothing can be seen of it": (LAUNCHING, seen(), []),
-    # -- what is told
+    # -- what is reported
     "what is launched is looked at": (STARTING, Due(), [do.Observe()]),
     "also while it runs": (RUNNING, Due(), [do.Observe()]),
     "and while it ends": (ending(Ending.FAILED), Due(), [do.Observe()]),
@@ -182,7 +182,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
     "in the engine's words where it has some": (STARTING, seen(words="on n1"), [do.MarkRunning("on n1", T)]),
     "so does an end that came before any sign": (STARTING, seen(*MAIN_LAST), ends(DONE, first=do.MarkRunning(RUNS, T))),
     "a gang with too little room is called so": (with_terms(RUNNING, whole=4), seen(), [do.Explain(ROOMLESS)]),
-    "one node is no nodes": (
+    "one node is singular": (
         with_terms(RUNNING, hosts=("h/0",), whole=1),
         seen(None, silences=(None,)),
         [do.Explain("attempt 2 runs on 1 node")],
@@ -195,7 +195,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
         seen(None, end(1)),
         ends(Verdict(Ending.FATAL, "node 1: exit 1", 1), 5.0),
     ),
-    "what was told to end waits for the cause": (RUNNING, seen(KILLED, None), [SAYS_SO, do.Await("cause_since", T)]),
+    "what was asked to end waits for the cause": (RUNNING, seen(KILLED, None), [SAYS_SO, do.Await("cause_since", T)]),
     "since the first time": (
         replace(RUNNING, cause_since=T - CAUSE_PATIENCE),
         seen(KILLED, None),
@@ -297,7 +297,7 @@ RULES: dict[str, tuple[AttemptState, Event, Sequence[do.Instruction]]] = {
         seen(stale="Slurm to answer"),
         [do.Save(), do.Stop(5.0, "why; waits for Slurm to answer")],
     ),
-    "a stop that fails is told": (ending(Ending.FAILED), Delayed("not allowed"), [do.Explain("not allowed")]),
+    "a stop that fails is reported": (ending(Ending.FAILED), Delayed("not allowed"), [do.Explain("not allowed")]),
     "so is a store that can't be read": (RUNNING, Delayed("the store is away"), [do.Explain("the store is away")]),
     "one that is closed stays so": (replace(ending(Ending.FAILED), closed=True), Gone(T, MAIN_LAST, ""), []),
     "a gang does not go before its end is decided": (RUNNING, Gone(T, MAIN_LAST, ""), []),

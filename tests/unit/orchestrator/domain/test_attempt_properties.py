@@ -195,7 +195,7 @@ def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_rea
             assert not follows or isinstance(follows[-1], do.Stop | do.Await)
         elif state.launched and (
             follows or seen.unread is None
-        ):  # of ends that are being read nothing is said at first
+        ):  # of ends that are being read nothing is reported at first
             assert isinstance(follows[0], do.Explain | do.MarkRunning) and follows[0].reason
 
 

@@ -6,10 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from orchestrator.domain.errors import NotServing
 from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.hosts import HERE, Host, Hosts, Limit, Placement, Queued, engine_of
-from orchestrator.domain.job import NodeEnd
 from orchestrator.domain.resources import EPSILON, Resources
 
 MACHINE = Host("ray/a", 4, ("0", "1"), 1024)
@@ -42,17 +40,6 @@ def test_a_long_text_is_cut_and_the_cut_is_counted(length: int, most: int, kept:
     text = "x" * length
     expected = text if kept is None else f"{text[:kept]} … ({length - kept} more characters)"
     assert excerpt(text, most) == expected
-
-
-def test_the_reason_of_a_node_s_end_has_1024_characters_at_most() -> None:
-    for length in (1024, 1025):
-        reason = NodeEnd(1, "x" * length, 1.0).reason
-        assert len(reason) <= 1024 and reason.endswith("x" if length == 1024 else "more characters)")
-
-
-def test_a_refusal_has_its_words_and_its_status() -> None:
-    error = NotServing("later", 503)
-    assert (str(error), error.status) == ("later", 503)
 
 
 amounts = st.builds(Resources, st.integers(0, 640).map(lambda n: n / 8), st.integers(0, 16), st.integers(0, 10**6))

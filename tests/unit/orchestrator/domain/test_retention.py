@@ -33,6 +33,8 @@ NOTHING = References()
 def test_an_old_run_that_holds_nothing_but_logs_goes_with_its_job() -> None:
     assert decide(RUN, [OLD], NOTHING) == Decision(True, ("old",))
     assert decide(None, [OLD], NOTHING) == Decision(False, ("old",)), "a job that never started"
+    waited = References.of([RetentionReference("job", "old", "job w waits for it")])
+    assert decide(None, [OLD], waited) == Decision(False, (), ("job w waits for it",))
 
 
 @pytest.mark.parametrize(
@@ -84,7 +86,7 @@ def test_old_jobs_go_without_their_run_where_that_holds_more(
     assert reason in " ".join(decision.reasons)
 
 
-def test_who_may_not_see_everything_is_not_told_what_needs_a_run() -> None:
+def test_who_may_not_see_everything_does_not_learn_what_needs_a_run() -> None:
     references = References.of(
         [RetentionReference("run", "r", "run secret is a clone of it")], ["model hidden can't be read"]
     )
@@ -98,7 +100,7 @@ def test_who_may_not_see_everything_is_not_told_what_needs_a_run() -> None:
         assert "something" in reason and "secret" not in reason and "hidden" not in reason
 
 
-def test_of_a_run_of_which_no_job_is_due_nothing_is_told() -> None:
+def test_of_a_run_of_which_no_job_is_due_nothing_is_reported() -> None:
     assert decide(RUN, [JobFacts("old")], NOTHING) == Decision(False, ())
     assert decide(RUN, [], NOTHING) == Decision(False, ()), "a run of another controller, or of a lost database"
 
@@ -122,7 +124,7 @@ def test_a_rule_is_a_time_or_off(rule: str, age: int | None) -> None:
 
 
 @pytest.mark.parametrize("rule", ["", "90", "d", "-1d", "90 days", "1e9d", "Off", "99999999d"])
-def test_anything_else_is_no_rule(rule: str) -> None:
+def test_anything_else_is_refused(rule: str) -> None:
     for parse in (age_of, rule_of):
         with pytest.raises(ValueError, match="expected days, hours or minutes, such as 90d"):
             parse(rule)

@@ -73,7 +73,7 @@ WRONG_TAGS = {
     "muster:account| |slurm|queue": " is empty; it is an account",
     "muster:images|refused|local": " is 'refused'; did you mean refuse?",
 }
-"""Tag, value and engine, of a queue or of a compute environment: what is said of it."""
+"""Tag, value and engine, of a queue or of a compute environment: the message about it."""
 
 
 @pytest.mark.parametrize("case", WRONG_TAGS)
@@ -176,7 +176,7 @@ def test_secrets_go_the_way_that_the_engine_declares(way: SecretValues, monkeypa
                 several.plan(gang)
         else:
             several.plan(gang)
-        supplied = several.with_secrets(gang).environments[0].get("KEY")
+        supplied = several.with_secrets(gang).nodes[0].environment.get("KEY")
         assert supplied == ("value" if way is SecretValues.ENVIRONMENT else None)
         monkeypatch.undo()
         with nullcontext() if way is SecretValues.REFERENCES else pytest.raises(SecretsError):

@@ -42,7 +42,7 @@ def load(name: str) -> dict[str, Any]:
     return found
 
 
-def test_the_launcher_s_file_holds_ray_s_own_schema_and_muster_is_told_how_far_it_grows() -> None:
+def test_the_launcher_s_file_holds_ray_s_own_schema_and_muster_knows_how_far_it_grows() -> None:
     ray = pytest.importorskip("ray", reason="NO RAY: its schema is not there")
     import jsonschema
 
@@ -98,6 +98,6 @@ def test_the_kuberay_manifest_is_a_raycluster_whose_nodes_share_token_and_volume
         assert {"RAY_AUTH_MODE", "RAY_AUTH_TOKEN"} <= variables
         assert {mount["name"] for mount in container["volumeMounts"]} <= volumes and "muster" in volumes
         assert "$KUBERAY_GEN_RAY_START_CMD" in container["args"][0]
-        assert pod["terminationGracePeriodSeconds"] > 30, "a node that is told to leave drains for 30 s"
+        assert pod["terminationGracePeriodSeconds"] > 30, "a node that has to leave drains for 30 s"
     head = spec["headGroupSpec"]["template"]["spec"]["containers"][0]
     assert {"name": "RAY_gcs_storage", "value": "rocksdb"} in head["env"]

@@ -81,7 +81,7 @@ def test_a_missing_secret_is_named_without_a_value(file: Path, value_from: str, 
     assert message in output and "hunter2" not in output
 
 
-def test_a_controller_gives_no_secrets_unless_it_was_told_to(file: Path) -> None:
+def test_a_controller_gives_no_secrets_unless_it_was_configured_to(file: Path) -> None:
     assert Secrets().of({"secrets": []}, "default") == {}
     with pytest.raises(SecretsError, match="muster serve --secrets"):
         Secrets().of(asking("db"), "default")

@@ -24,7 +24,7 @@ from orchestrator.engines.toolkit.environment import PRIVATE, inherited
 from orchestrator.engines.toolkit.log_copy import LogCopy
 from orchestrator.engines.toolkit.outcomes import all_recorded, log_of, record, recorded, seen, store_facts
 from orchestrator.engines.toolkit.view import CachedView
-from orchestrator.engines.toolkit.waiting import stop_within, wait_until
+from orchestrator.engines.toolkit.waiting import stop_within
 from shared_store.contract.node import LOG_LIMIT
 from shared_store.volume.layout import Store
 from shared_store.volume.log_files import LogWriter
@@ -48,13 +48,6 @@ def test_a_started_process_has_the_variables_that_programs_need_and_those_that_a
     named = {"HF_TOKEN": "hunter2", "NVIDIA_API_KEY": "hunter2"}
     assert inherited() == {**theirs, **named}, "and the controller's own never"
     assert inherited(named=["KUBECONFIG"]) == {**theirs, "KUBECONFIG": "hunter2"}
-
-
-def test_waiting_ends_when_the_condition_holds_or_the_time_is_over() -> None:
-    looks = iter([False, False, True])
-    assert wait_until(lambda: next(looks), 60.0, 0.0) and next(looks, None) is None
-    assert not wait_until(lambda: False, 0.0)
-    assert wait_until(lambda: True, 0.0), "it looks once at least"
 
 
 @pytest.fixture
@@ -123,16 +116,6 @@ def test_lines_for_which_there_was_no_room_are_written_later(handle: Handle, mon
         copy.append(["d\n"])
         assert copy.is_whole
     assert path.read_text() == "a\nb\nc\nd\n"
-
-
-def test_an_action_that_is_not_tried_any_more_is_forgotten_and_a_waiting_one_is_kept() -> None:
-    backoff = Backoff(logging.getLogger("test"), first=0.0)
-    backoff.failed(("start", "over"), "can't start")
-    waiting = Backoff(logging.getLogger("test"), first=60.0)
-    waiting.failed(("start", "waits"), "can't start")
-    for each in (backoff, waiting):
-        each.tidy(idle=0.0)
-    assert not backoff and waiting.failure(("start", "waits")) == "can't start"
 
 
 def test_an_action_that_fails_at_every_other_try_is_logged_once_and_waits_longer_each_time(

@@ -96,7 +96,7 @@ def test_a_look_that_fails_as_none_should_is_not_the_last_one(
     keys.close()
 
 
-def test_while_the_database_can_not_be_read_the_keys_stay_and_a_damaged_one_is_refused_alone(
+def test_while_the_database_can_t_be_read_the_keys_stay_and_a_damaged_one_is_refused_alone(
     keys: KeyStore, database: Database, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     keys.create("a")

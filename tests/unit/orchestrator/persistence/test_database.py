@@ -43,7 +43,7 @@ def test_a_first_start_that_is_interrupted_leaves_nothing_half_made(tmp_path: Pa
 
 
 class Crowd:
-    """Callers that all wait while somebody else writes, then are carried out together."""
+    """Callers that all wait while another one writes, then are carried out together."""
 
     def __init__(self, home: Path) -> None:
         nothing: Any = None  # additions ask neither the disk nor the loop
@@ -127,15 +127,6 @@ def test_a_definition_is_read_once_however_often_its_row_is_loaded_until_the_row
     with pytest.raises(ValueError, match="the job's row in the database is damaged"):
         gangs.of("j", {})
     assert len(gangs.of("j", properties(2)).nodes) == 2
-
-
-def test_only_the_definitions_used_last_are_remembered() -> None:
-    gangs = Gangs(most=2)
-    a, b = gangs.of("a", properties(1)), gangs.of("b", properties(1))
-    assert gangs.of("a", properties(1)) is a
-    gangs.of("c", properties(1))
-    assert gangs.of("a", properties(1)) is a
-    assert gangs.of("b", properties(1)) is not b
 
 
 @pytest.fixture

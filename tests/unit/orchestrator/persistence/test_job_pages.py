@@ -17,7 +17,6 @@ from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.job_counts import ArrayRole, JobCounts, note_rows
 from orchestrator.persistence.job_pages import contains, count, place_of, read_page
 from orchestrator.persistence.keyset import Cursor
-from orchestrator.persistence.retention_rows import forget_jobs
 from orchestrator.persistence.session import Database
 
 QUEUES = [f"queue-{number}" for number in range(60)]
@@ -243,15 +242,6 @@ def change(session: Session, draw: random.Random, turn: int) -> None:
                 note_rows(session, queue, status, ArrayRole.of(parent, kind), -1)
             session.expunge(one)
             session.execute(delete(Job).where(Job.id == one.id))
-
-
-def test_history_that_is_forgotten_is_not_counted(database: Database) -> None:
-    with database.session() as session:
-        session.add_all([job("old", 1, status="FAILED", stopped_at=5), job("new", 2, status="FAILED", stopped_at=50)])
-    assert database.counts.by_status() == {"FAILED": 2}
-    with database.session() as session:
-        forget_jobs(session, ["old"])
-    assert database.counts.by_status() == {"FAILED": 1}
 
 
 def test_a_commit_that_fails_counts_nothing(database: Database) -> None:

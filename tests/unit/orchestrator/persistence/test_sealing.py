@@ -1,4 +1,4 @@
-"""Sealing: what a copy of the database reveals, and what is said where the sealing key is not the database's."""
+"""Sealing: what a copy of the database reveals, and the message where the sealing key is not the database's."""
 
 from __future__ import annotations
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from orchestrator.domain.gang import Shape, gang_needs
 from orchestrator.domain.hosts import Host, Placement
-from orchestrator.domain.resources import Resources
 from orchestrator.scheduling.decisions import Start
 from orchestrator.scheduling.snapshot import ComputeEnvironment, FairShare
 from tests.support.orchestrator.scheduling import (
     CAPACITY,
     FAIR,
-    REQUIREMENT,
     Pass,
     environment,
     gang,
@@ -25,11 +22,6 @@ from tests.support.orchestrator.scheduling import (
 )
 
 # -- gangs ------------------------------------------------------------------------------------------------------------
-
-
-def test_without_waiting_jobs_nothing_is_decided() -> None:
-    decided = Pass([host()])
-    assert (decided.starts, decided.preempts, decided.cancels, decided.waits()) == ((), (), (), "")
 
 
 def test_a_gang_that_fits_starts_with_what_it_asked_for_and_no_gpu_is_given_twice() -> None:
@@ -66,14 +58,6 @@ def test_an_elastic_gang_starts_with_as_many_nodes_as_fit() -> None:
 def test_resources_of_a_vanished_host_are_not_counted() -> None:
     held = [running("lost", on("gone", 4)), running("cart", on("a", 1))]
     assert Pass([host()], [job("ant", 3)], held).started == "ant:a"
-
-
-def test_the_shape_of_a_job_is_read_from_its_definition_once() -> None:
-    resources = [{"type": "VCPU", "value": "2"}, {"type": "GPU", "value": "1"}, {"type": "MEMORY", "value": "512"}]
-    ranges = [{"targetNodes": "0:", "container": {"image": "x", "resourceRequirements": resources}}]
-    read = gang_needs({"numNodes": 2, "mainNode": 1, "nodeRangeProperties": ranges})
-    whole = Shape((Resources(2, 1, 512), Resources(2, 1, 512)), 2, 1)
-    assert read.shape == whole and hash(read.shape) == hash(whole) and read.shape is read.shape
 
 
 # -- order ------------------------------------------------------------------------------------------------------------
@@ -142,14 +126,6 @@ def test_compute_environments_are_tried_in_the_queues_order() -> None:
     assert [start.compute_environment for start in decided.starts] == ["q", "p", "p"]
 
 
-def test_a_gang_stays_in_one_compute_environment() -> None:
-    environments, queues = [environment("p", ("a",)), environment("q", ("b",))], [queue(environments=("p", "q"))]
-    decided = Pass([host("a", 2), host("b", 2)], [job("wide", gang(*[node()] * 3))], (), queues, environments)
-    assert decided.starts == ()
-    why = "needs 3 nodes with 3 CPUs, 0 GPUs, 300 MiB in all; all hosts together have 2 CPUs, 0 GPUs, 8 GiB"
-    assert decided.reason("wide") == f"{REQUIREMENT} - compute environment p: {why}; compute environment q: {why}"
-
-
 def test_a_compute_environment_uses_no_more_cpus_than_it_may() -> None:
     held = [running("cart", on("a", 2)), running("other", on("b", 1), environment="rest")]
     environments = [environment(max_cpus=5), environment("rest")]
@@ -181,10 +157,3 @@ def test_one_machine_that_two_engines_have_is_not_given_out_twice() -> None:
     # and a compute environment of every engine has it once
     everywhere = Pass([one, two], [job("both", gang(node(3), node(3)))])
     assert everywhere.started == "" and "all hosts together have 4 CPUs, 1 GPU" in everywhere.reason("both")
-
-
-def test_compute_environments_that_share_a_host_do_not_give_it_out_twice() -> None:
-    environments = [environment("p", ("a",)), environment("q", ("a", "b"))]
-    queues = [queue("one", 2, ("p",)), queue("two", 1, ("q",))]
-    waiting = [job("x", 3, queue="one"), job("y", 3, queue="two")]
-    assert Pass([host("a"), host("b")], waiting, (), queues, environments).started == "x:a y:b"

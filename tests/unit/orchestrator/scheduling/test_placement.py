@@ -213,7 +213,7 @@ pools_strategy = st.lists(
 
 @settings(max_examples=200)
 @given(hosts_strategy, st.lists(machines, min_size=4, max_size=4), pools_strategy, nodes, st.integers(1, 4), st.data())
-def test_a_gang_alone_starts_exactly_where_it_is_said_to_fit(
+def test_a_gang_alone_starts_exactly_where_it_is_reported_to_fit(
     hosts: list[Host], on: list[str], pools: list, each: Resources, count: int, data: st.DataObject
 ) -> None:
     hosts = [replace(host, machine=machine) for host, machine in zip(hosts, on, strict=False)]

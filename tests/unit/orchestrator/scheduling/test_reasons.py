@@ -49,7 +49,7 @@ def test_a_job_that_can_never_start_says_so_even_behind_one_that_waits_and_delay
     )
 
 
-def test_while_an_engine_has_not_told_its_hosts_its_jobs_wait_and_say_so() -> None:
+def test_while_an_engine_has_not_reported_its_hosts_its_jobs_wait_and_name_it() -> None:
     silent = replace(environment("silent", hosts=()), unknown="the ray engine has not answered yet")
     existing = environment("there")
     queues = [queue("silent", environments=("silent",)), queue("both", environments=("silent", "there"))]

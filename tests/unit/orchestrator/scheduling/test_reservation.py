@@ -97,11 +97,6 @@ def test_long_jobs_together_leave_the_head_its_resources_and_no_more_is_kept() -
     assert Pass([host(cpus=6)], elastic, [cart(3, timeout=700)]).started == "small:a next:a"
 
 
-def test_memory_is_kept_too() -> None:
-    waiting = line(job("large", gang(node(1, 0, 1000))), job("long"))
-    assert Pass([host(memory=1000)], waiting, [running("cart", on("a", 1, memory=500), timeout=700)]).started == ""
-
-
 def test_gpus_are_kept_by_number() -> None:
     held = [running("cart", on("a", 1, [0, 1]), timeout=700)]
     waiting = line(job("large", gang(node(1, 3))), *[job(f"j{i}", gang(node(1, 1))) for i in range(2)])
@@ -230,12 +225,6 @@ def test_a_queue_keeps_part_of_its_compute_environment_for_shares_that_are_not_a
     )
     elastic = [job("ant", gang(*[node(1, 1)] * 6, minimum=2), share="s")]
     assert Pass([host(cpus=8, gpus=8)], elastic, queues=[queue(policy=HALF)]).started == "ant:a+a+a+a"
-
-
-def test_within_its_quota_a_job_waits_for_room_like_any_other() -> None:
-    waiting, held = line(job("first", 2), job("second")), [running("cart", on("a", 4), queue="other")]
-    decided = Pass([host()], waiting, held, [queue(policy=HALF), queue("other")])
-    assert decided.started == "" and ", behind job first (first-01), " in decided.reason("second")
 
 
 @pytest.mark.parametrize(

@@ -59,7 +59,7 @@ def test_one_evaluation_runs_at_a_time_and_the_newest_checkpoint_is_next() -> No
 
 def test_the_last_checkpoint_is_left_to_the_training_itself_and_a_later_epoch_is_newer() -> None:
     known, found = look(saved(90, 100), Counted("00000080-e1", 0), every=1)
-    assert (known, found) == (Counted("00000100-e1", 1), 0), "the training is done: 90 is no news any more"
+    assert (known, found) == (Counted("00000100-e1", 1), 0), "the training is done: 90 is not new any more"
     assert look(saved(90), Counted("00000080-e1", 0), every=1)[1] == 90
     known, found = look([*saved(50, 60), *saved(30, 40, epoch=2)], Counted("00000060-e1", 0))
     assert (known, found) == (Counted("00000040-e2", 0), 40)

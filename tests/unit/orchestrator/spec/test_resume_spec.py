@@ -113,7 +113,7 @@ def sections_of(annotation: Any) -> list[type[BaseModel]]:
 
 
 def keys_of(model: type[BaseModel], path: str = "") -> Iterator[str]:
-    """Every key of the spec that is no section."""
+    """Every key of the spec but the sections."""
     for name, field in model.model_fields.items():
         inner = sections_of(field.annotation)
         yield from (key for section in inner for key in keys_of(section, f"{path}{name}."))

@@ -81,7 +81,7 @@ WRONG = {
     "Ant ppo: {steps: 8}": "ppo: not a key of AntConfig; settings of ppo stand under train.ppo",
     "Ant sac: {steps: 8}": "sac: not a key of AntConfig; settings of sac stand under train.sac",
 }
-"""Task and configuration: what is said of it."""
+"""Task and configuration: the message about it."""
 
 
 @pytest.mark.parametrize("case", WRONG)

@@ -73,7 +73,7 @@ def test_of_any_exception_of_the_program_itself(tmp_path: Path, text: str, fault
         "import os\nos.write(2, b'no traceback\\n')\nraise SystemExit(1)",
     ],
 )
-def test_what_comes_from_outside_the_program_is_no_fault(tmp_path: Path, text: str) -> None:
+def test_what_comes_from_outside_the_program_is_not_a_fault(tmp_path: Path, text: str) -> None:
     assert raised(tmp_path, text) is None
 
 

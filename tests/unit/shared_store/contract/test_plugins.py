@@ -125,7 +125,7 @@ def test_of_two_copies_of_a_package_the_one_counts_that_comes_first_on_the_path(
     [
         ("raise SystemExit(3)", "tally:PLUGIN can't be imported (it exits with 3)"),
         ("1 / 0", "tally:PLUGIN can't be imported (division by zero)"),
-        ("PLUGIN = 3", "tally:PLUGIN is no Plugin of shared_store.contract.plugins"),
+        ("PLUGIN = 3", "tally:PLUGIN is not a Plugin of shared_store.contract.plugins"),
     ],
 )
 def test_a_plug_in_that_can_t_be_imported_is_one_line(folder: Path, line: str, words: str) -> None:
@@ -154,7 +154,7 @@ def test_rules_lack_nothing(folder: Path) -> None:
     section = A_SECTION.replace("t.m:RULES", "tally_parts:RULES")
     write_package(folder, "tally", f"Plugin(sections=({section},))", "class RULES: count = ('trials', 3)")
     assert refusal(rules_of, "tally", error=PluginError) == (
-        "plug-in tally: sections: tally_parts:RULES is no EvaluationRules: it has no refusal"
+        "plug-in tally: sections: tally_parts:RULES is not an EvaluationRules: it has no refusal"
     )
     assert rules_of("evaluate") is None and declared.evaluating()[-1] == "tally"
 

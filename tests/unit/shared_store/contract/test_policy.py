@@ -131,7 +131,7 @@ def test_a_contract_of_format_1_is_read_with_fewer_entries() -> None:
     assert differences(existing, CONTRACT) == [] == differences(CONTRACT, existing)
 
 
-def test_values_that_follow_from_a_robot_s_file_can_be_left_out_and_meanings_can_not() -> None:
+def test_values_that_follow_from_a_robot_s_file_can_be_left_out_unlike_meanings() -> None:
     def changed(found: dict[str, Any]) -> None:
         found["actions"][0].update(
             stiffness=30.0, damping=1.0, scale=0.5, offset=0.4, default_position=0.4, effort_limit=20.0

@@ -1,4 +1,4 @@
-"""The epoch of a run only grows, and an attempt that it left behind is told so."""
+"""The epoch of a run only grows, and an attempt that it left behind is refused."""
 
 from __future__ import annotations
 

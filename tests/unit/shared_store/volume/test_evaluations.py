@@ -81,14 +81,6 @@ def test_the_best_checkpoint_is_that_of_two_evaluated_ones_and_else_that_of_the_
     assert best() == 3
 
 
-def test_retention_keeps_checkpoints_that_a_job_evaluated(run: Run) -> None:
-    evaluate(run, "00000003-e1-1f2e3d4c", 1.0)
-    add_checkpoint(Store(run.path.parent.parent), "taught", 12)
-    assert retain(run, keep=1) == ["00000009-e1"]
-    left = [each.iteration for each in list_checkpoints(run)]
-    assert left == [3, 6, 12], "evaluated, of the greatest score, the newest"
-
-
 def test_retention_keeps_of_evaluations_that_keep_nothing_the_best_and_what_is_still_to_be_evaluated(run: Run) -> None:
     store = Store(run.path.parent.parent)
     add_checkpoint(store, "taught", 12)

@@ -126,7 +126,7 @@ def test_json_that_is_not_a_plain_object_within_the_limits_is_damaged(tmp_path: 
         read_json(tmp_path / "value.json", largest=1000 if len(content) < 2000 else 100_000)
 
 
-def test_json_that_is_no_regular_file_is_damaged_and_never_waited_for(tmp_path: Path) -> None:
+def test_json_that_is_not_a_regular_file_is_damaged_and_never_waited_for(tmp_path: Path) -> None:
     write_json(tmp_path / "other.json", {})
     (tmp_path / "directory").mkdir()
     (tmp_path / "link").symlink_to("other.json")

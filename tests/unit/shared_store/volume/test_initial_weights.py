@@ -99,17 +99,6 @@ def test_a_name_that_is_taken_is_never_written_over_and_a_published_run_can_be_t
     assert names(store) == ["source"]
 
 
-def test_leftovers_of_the_same_owner_are_cleared_away_and_nobody_else_s(store: Store) -> None:
-    first, second = new(store), new(store)
-    first.copy()
-    leftovers = [store.path / "runs" / f".{owner}.00.clone" for owner in ("me", "you")]
-    for path in leftovers:
-        path.mkdir()
-    second.copy()
-    assert [path.exists() for path in leftovers] == [False, True]
-    assert first.publish("heir", {"run": "heir"}).path.is_dir(), "what is being made was left alone"
-
-
 def test_a_lineage_that_leads_elsewhere_is_refused(store: Store) -> None:
     run = heir(store)
     text = (run.path / "run.json").read_text()

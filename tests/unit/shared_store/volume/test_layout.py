@@ -47,29 +47,17 @@ def test_a_path_becomes_absolute_or_is_named_with_the_reason_why_it_can_be_no_di
         == f"store {path}: not writable (Not a directory); see whether its volume is mounted, or choose another with --store"
     )
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("HOME", "/home/somebody")
+    monkeypatch.setenv("HOME", "/home/someone")
     assert Store("store").path == tmp_path / "store"
-    assert Store("~/store").path == Path("/home/somebody/store")
+    assert Store("~/store").path == Path("/home/someone/store")
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", ".hidden", "-x", "a/b", "../a", "a b", "ä", "a\n", "x" * 129])
-def test_a_run_has_the_name_of_a_directory_and_can_not_leave_the_store_by_it(tmp_path: Path, name: str) -> None:
+def test_a_run_has_the_name_of_a_directory_and_can_t_leave_the_store_by_it(tmp_path: Path, name: str) -> None:
     for good in ("ant", "a", "0", "Ant_v2.1-b", "x" * 128):
         assert Store(tmp_path).run(good).path == tmp_path / "runs" / good
     with pytest.raises(StoreError, match="use letters, digits"):
         Store(tmp_path).run(name)
-
-
-def test_everything_of_a_run_lies_where_the_design_says(tmp_path: Path) -> None:
-    run = Store(tmp_path).run("ant")
-    base = tmp_path / "runs" / "ant"
-    assert run.checkpoints == base / "checkpoints"
-    assert run.metrics == base / "metrics"
-    assert run.evaluations == base / "evaluations"
-    assert run.exports == base / "exports"
-    assert run.log("job", 2, 1) == base / "logs" / "job" / "2" / "node-1.log"
-    assert run.outcome("job", 2, 1) == base / "outcomes" / "job" / "2" / "node-1.json"
-    assert list(tmp_path.iterdir()) == [], "asking for a path creates nothing"
 
 
 def test_runs_keep_their_descriptions_and_are_listed_by_name_only_if_they_were_created(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from orchestrator.api.logs import log_events
 from orchestrator.api.logs.log_events import LogFile
 from shared_store.contract.node import LEAST_LOG_LIMIT
 from shared_store.volume.layout import Run
-from shared_store.volume.log_files import LogWriter, left_out, log_segments, read_log, segments_of
+from shared_store.volume.log_files import LogWriter, left_out, segments_of
 from shared_store.volume.log_view import LogView
 from shared_store.volume.logs import REPLACED, format_line, timestamp
 
@@ -250,13 +250,6 @@ def test_counting_the_lines_of_a_log_takes_no_memory_of_its_size(tmp_path: Path)
         assert tracemalloc.get_traced_memory()[1] < 8 << 20
     finally:
         tracemalloc.stop()
-
-
-def test_files_of_other_names_are_no_part_of_a_log(tmp_path: Path) -> None:
-    for name in ("node-0.log", "node-0.log.gz", "node-0.log.1", f"node-0.log.{5:015d}.2", "node-x.log", "notes"):
-        (tmp_path / name).write_text("x\n")
-    assert {name: [s.start for s in found] for name, found in log_segments(tmp_path).items()} == {"node-0.log": [0, 5]}
-    assert read_log(segments_of(tmp_path / "node-0.log"), 2, 100).left_out == (2, 3)
 
 
 def test_one_look_passes_over_a_bounded_part_of_a_hole_and_the_next_one_goes_on(

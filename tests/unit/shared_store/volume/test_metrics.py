@@ -59,7 +59,7 @@ def test_a_last_line_that_a_crash_cut_short_is_passed_over(run: Run, torn: bytes
     assert history(run) == [(1, 1), (2, 1)]
 
 
-def test_lines_that_are_no_records_and_files_that_are_not_ours_are_passed_over(run: Run) -> None:
+def test_lines_that_are_not_records_and_files_that_are_not_ours_are_passed_over(run: Run) -> None:
     attempt(run, 1, 0, 1)
     with open(run.metrics / "metrics-e1.jsonl", "ab") as file:
         file.write(b'[]\nnot json\n{"note": 1}\n\n{"iteration": 2, "epoch": 1}\n')
@@ -166,14 +166,6 @@ def test_a_page_of_a_long_history_is_read_without_the_rest(run: Run, parsed: lis
 
 def points(run: Run, *arguments: int) -> list[tuple[int, int]]:
     return [(record["iteration"], record["epoch"]) for record in sampled(run, *arguments)]
-
-
-def test_a_sample_of_a_short_history_is_all_of_it_and_of_none_is_nothing(run: Run) -> None:
-    assert sampled(run) == []
-    attempt(run, 1, 0, 0)
-    assert sampled(run) == []
-    attempt(run, 2, 0, 7)
-    assert points(run) == [(i, 2) for i in range(1, 8)]
 
 
 def test_a_sample_of_a_long_history_is_spread_evenly_and_ends_with_its_newest_record(run: Run) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import shutil
@@ -42,14 +41,6 @@ def flip(path: Path, place: int) -> None:
     path.write_bytes(bytes(data))
 
 
-def test_a_sealed_bundle_verifies_and_lists_every_other_file(bundle: Path) -> None:
-    manifest = bundles.verify(bundle)
-    assert sorted(manifest["files"]) == ["policy.onnx", "robot/arm.xml"]
-    digest = hashlib.sha256(b"weights").hexdigest()
-    assert manifest["files"]["policy.onnx"] == {"size": 7, "sha256": digest}
-    assert (manifest["run"], manifest["score"]) == ("ant", 1.5)
-
-
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -80,11 +71,11 @@ def test_every_changed_byte_of_the_manifest_itself_is_found(bundle: Path) -> Non
     bundles.verify(bundle)
 
 
-def test_a_manifest_can_not_name_a_path_that_leads_elsewhere_or_be_of_a_newer_format(bundle: Path) -> None:
+def test_a_manifest_can_t_name_a_path_that_leads_elsewhere_or_be_of_a_newer_format(bundle: Path) -> None:
     path = bundle / "manifest.json"
     manifest = json.loads(path.read_text())
     path.write_text(json.dumps({**manifest, "files": {"../secret": {"size": 1, "sha256": "0"}}}))
-    with pytest.raises(DamagedBundle, match=r"names '\.\./secret', which is no file of it"):
+    with pytest.raises(DamagedBundle, match=r"names '\.\./secret', which is not a file of it"):
         bundles.verify(bundle)
     path.write_text(json.dumps({**manifest, "format": 2}))
     with pytest.raises(DamagedBundle, match="has format 2, this Muster reads up to 1; upgrade Muster"):

@@ -56,23 +56,6 @@ def test_an_outcome_of_other_types_or_sizes_is_none(tmp_path: Path, change: dict
     assert node_outcomes.read_outcome(Run(tmp_path), "job", 1, 0) is None
 
 
-@pytest.mark.parametrize(
-    ("ends", "cause"),
-    [
-        ([(False, 1.0)], 0),
-        ([(True, 1.0)], 0),
-        ([(False, 2.0), (False, 1.0)], 1),
-        ([(False, 1.0), (False, 1.0)], 0),
-        ([(True, 1.0), (False, 9.0)], 1),
-        ([(False, 9.0), (True, 1.0)], 0),
-        ([(True, 1.0), (False, 9.0), (False, 8.0), (True, 0.5)], 2),
-        ([(True, 2.0), (True, 1.0)], 1),
-    ],
-)
-def test_the_first_that_was_not_asked_to_end_is_the_cause(ends: list[tuple[bool, float]], cause: int) -> None:
-    assert node_outcomes.first_cause(ends) == cause
-
-
 def test_an_outcome_is_read_as_it_was_written_and_so_is_one_of_an_older_version() -> None:
     requested = replace(OUTCOME, requested=True)
     written = asdict(requested)

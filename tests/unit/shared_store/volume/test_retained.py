@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -119,22 +118,6 @@ def test_directories_that_may_not_be_written_are_kept_where_they_are_and_removed
         assert list(kept) == [fixed.path] and fixed.path.is_dir() and len(thrown) == 1
         assert trash.remove(thrown[0]) and trash.empty(store) == []
         assert os.stat(fixed.path).st_mode & 0o777 == 0o555, "a link is removed, not followed"
-
-
-def test_what_can_t_be_removed_is_named_and_the_rest_goes(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    stuck, other = logged(store, "stuck"), logged(store, "other")
-    [existing, _], _ = trash.discard(store, [stuck.path, other.path])
-    is_held = True
-    remove = shutil.rmtree
-
-    def held(path: Path, ignore_errors: bool = False) -> None:
-        if not (is_held and path == existing):
-            remove(path, ignore_errors=ignore_errors)
-
-    monkeypatch.setattr("shutil.rmtree", held)
-    assert trash.empty(store) == [existing]
-    is_held = False
-    assert trash.empty(store) == []
 
 
 def test_nothing_outside_of_the_store_is_thrown_away(store: Store, tmp_path: Path) -> None:

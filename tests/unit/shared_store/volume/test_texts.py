@@ -32,7 +32,7 @@ def test_a_long_text_is_referred_to_and_a_short_one_stays(section: str) -> None:
     assert beside(shortened) == (shortened, {})
 
 
-def test_what_is_no_reference_is_left_alone(tmp_path: Path) -> None:
+def test_what_is_not_a_reference_is_left_alone(tmp_path: Path) -> None:
     for value in (
         SHORT,
         "path.py",

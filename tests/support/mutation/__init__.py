@@ -1,1 +1,0 @@
-"""Mutation: whether the tests notice small faults in a module (``make mutants``)."""
