@@ -8,10 +8,10 @@ from typing import Any, ClassVar
 
 import newton
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from worker.simulation.collisions import mark
 from worker.simulation.robot import UPRIGHT, check_name
+from worker.simulation.robot_elements import empty_builder
 
 
 @dataclass(frozen=True)
@@ -61,14 +61,13 @@ class Object:
         """Add the object to a builder that holds one world.
 
         Args:
-            builder: ``SolverMuJoCo.register_custom_attributes`` was called on it.
+            builder: As of :func:`worker.simulation.robot_elements.empty_builder`.
 
         Raises:
             ValueError: The name is taken.
         """
         check_name(builder, self.name)
-        own = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(own)
+        own = empty_builder()
         pose = wp.transform(wp.vec3(*self.position), wp.normalize(wp.quat(*self.rotation)))
         body = own.add_link(xform=pose, label=self.name)
         material = newton.ModelBuilder.ShapeConfig(density=self.mass / self.volume(), mu=self.friction)

@@ -218,6 +218,13 @@ def is_carrier(label: str) -> bool:
     return CARRIER in short(label)
 
 
+def empty_builder() -> newton.ModelBuilder:
+    """A builder with the attributes of MuJoCo that importers and solver use."""
+    builder = newton.ModelBuilder()
+    SolverMuJoCo.register_custom_attributes(builder)
+    return builder
+
+
 def keep_inertias(builder: newton.ModelBuilder) -> None:
     """Let Newton leave moments of inertia as they are: MuJoCo's compiler judges them."""
     builder.balance_inertia = False

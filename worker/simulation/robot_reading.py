@@ -25,7 +25,7 @@ from worker.simulation import actuators as actuation
 from worker.simulation import robot_comparison as robot_judge
 from worker.simulation import robot_files, robot_mjcf, robot_reference, robot_usd, robot_values
 from worker.simulation.robot_comparison import Comparison, RobotDifference
-from worker.simulation.robot_elements import keep_inertias, short
+from worker.simulation.robot_elements import empty_builder, keep_inertias, short
 from worker.simulation.robot_files import RobotFile
 from worker.simulation.robot_identity import identity
 from worker.simulation.robot_reference import ReferenceModel
@@ -195,8 +195,7 @@ def _amended(robot: Robot, builder: newton.ModelBuilder, model: Any, found: Comp
 
 def _imported(robot: Robot, file: RobotFile) -> newton.ModelBuilder:
     """The robot as Newton's importer builds it."""
-    builder, ignored = newton.ModelBuilder(), [fnmatch.translate(pattern) for pattern in robot.ignore]
-    SolverMuJoCo.register_custom_attributes(builder)
+    builder, ignored = empty_builder(), [fnmatch.translate(pattern) for pattern in robot.ignore]
     floating = None if robot.fixed is None else not robot.fixed
     try:
         with robot_files.quiet():  # what the importer leaves out or changes is found by comparison

@@ -14,7 +14,7 @@ from newton.solvers import SolverMuJoCo
 from shared_store.contract.error_text import nearest
 from worker.simulation.collisions import share, share_ground
 from worker.simulation.drives import Drives, has_drives
-from worker.simulation.robot_elements import keep_inertias, unload
+from worker.simulation.robot_elements import empty_builder, keep_inertias, unload
 from worker.simulation.solver import Solver
 from worker.simulation.structs import filled
 from worker.simulation.terrain import Terrain
@@ -124,8 +124,7 @@ class Worlds:
         solver_options: Mapping[str, Any],
     ) -> None:
         _check_options(solver_options)
-        scene = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(scene)
+        scene = empty_builder()
         has_masks = share(template)
         keep_inertias(scene)
         scene.replicate(template, world_count)

@@ -15,13 +15,12 @@ import worker.simulation  # noqa: F401 - before Newton, which it keeps from impo
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from shared_store.volume.layout import Run
 from worker.learning.job import configure, user_errors, with_texts
 from worker.settings.errors import UserError
 from worker.simulation import robot_files
-from worker.simulation.robot_elements import is_carrier
+from worker.simulation.robot_elements import empty_builder, is_carrier
 from worker.simulation.robot_view import RobotView
 from worker.simulation.structs import numbers
 from worker.simulation.terrain import Terrain
@@ -77,8 +76,7 @@ class Stage:
         self.links = _link_names([template.body_label[body] for body in bodies])
         self.link_of = {body: link for link, body in enumerate(bodies)}
         self.root = self.link_of[views[0].root_body]
-        scene = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(scene)
+        scene = empty_builder()
         scene.replicate(template, worlds)
         stands_on, first = sketch.stands_on(), len(scene.shape_color)
         if isinstance(stands_on, Terrain):

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.support.worker.terms_rig import BODIES, ROOT, WORLDS, Rig, array, close, matrix, terms_of
 from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.robot_elements import empty_builder
 
 
 @pytest.fixture(scope="module")
@@ -45,11 +46,9 @@ def test_a_body_with_an_off_centre_mass_moves_as_mujoco_says(rig: Rig) -> None:
     world, of_com = velocities(model, data)
 
     # the same body in Newton, whose free joint has the velocity of the centre of mass
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
+    builder = empty_builder()
     builder.add_mjcf(xml, ctrl_direct=True)
-    scene = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(scene)
+    scene = empty_builder()
     scene.replicate(builder, 1)
     found = scene.finalize(device="cpu")
     solver = SolverMuJoCo(found, separate_worlds=True, use_mujoco_cpu=True)  # steps with MuJoCo itself

@@ -13,6 +13,7 @@ from tests.support.refusals import refusal
 from tests.support.worker.randomized_worlds import build_episodes
 from worker.simulation.episodes import STEPS, EpisodeArrays, random_stream
 from worker.simulation.robot_arrays import RobotArrays
+from worker.simulation.robot_elements import empty_builder
 from worker.simulation.terrain import ROUGH_KINDS, Terrain
 from worker.simulation.terrain_arrays import Ground, TerrainArrays, on_terrain, terrain_origin
 from worker.simulation.terrain_levels import walked_levels
@@ -193,8 +194,7 @@ def test_an_impossible_configuration_is_refused_in_one_line(build: Any, parts: l
 
 
 def test_shapes_are_one_a_kind_and_boxes_where_the_ground_is_level() -> None:
-    scene = newton.ModelBuilder()
-    newton.solvers.SolverMuJoCo.register_custom_attributes(scene)
+    scene = empty_builder()
     shapes = Terrain(columns=14, levels=2).add_to(scene)
     labels = [scene.shape_label[shape] for shape in shapes]
     assert all(label.startswith("terrain/") for label in labels)

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import newton
+
 from worker.simulation.robot import Robot
+from worker.simulation.robot_elements import empty_builder
 from worker.simulation.robot_reading import Reading
 from worker.simulation.robot_twins import Twins
 
@@ -19,6 +22,14 @@ def mjcf(body: str, rest: str = '<actuator><motor joint="j"/></actuator>', befor
 HINGE = '<joint name="j" axis="0 1 0"/>'
 SECOND = f'<body name="c" pos="0 0 -.6"><joint name="k" axis="0 1 0"/>{BOX}</body>'
 SITE = '<site name="t" pos="0 .1 0"/>'
+
+
+def template(*items: Any) -> newton.ModelBuilder:
+    """One world of robots and objects."""
+    builder = empty_builder()
+    for item in items:
+        item.add_to(builder)
+    return builder
 
 
 def read(file: str, **options: Any) -> Reading:

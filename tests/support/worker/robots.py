@@ -12,8 +12,8 @@ import mujoco
 import newton
 import numpy as np
 import pytest
-from newton.solvers import SolverMuJoCo
 
+from tests.support.worker.robot_texts import template
 from worker.simulation.actuators import PositionActuator
 from worker.simulation.collisions import Collision
 from worker.simulation.robot import Robot
@@ -33,12 +33,9 @@ def build(
     *items: Any, worlds: int = 1, ground: bool = True, timestep: float = 0.005, substeps: int = 1, **options: Any
 ) -> tuple[newton.ModelBuilder, Worlds]:
     """A template of these robots and objects, and its worlds on the processor."""
-    template = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(template)
-    for item in items:
-        item.add_to(template)
+    scene = template(*items)
     built = Worlds(
-        template,
+        scene,
         worlds,
         "cpu",
         timestep=timestep,
@@ -47,7 +44,7 @@ def build(
         ground=ground,
         solver_options={"njmax": 300, "nconmax": 80, **options},
     )
-    return template, built
+    return scene, built
 
 
 def reference(robot: Robot, timestep: float = 0.005) -> mujoco.MjModel:

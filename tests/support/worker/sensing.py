@@ -9,10 +9,10 @@ import mujoco
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from worker.simulation.episodes import EpisodeArrays
 from worker.simulation.robot import Robot
+from worker.simulation.robot_elements import empty_builder
 from worker.simulation.robot_view import RobotView, body_arrays
 from worker.simulation.sensors.sensor import Sensor, SensorContext
 from worker.simulation.terrain import Terrain
@@ -46,14 +46,12 @@ def walker(height: float = 0.36, sensors: str = "") -> str:
 
 def template_of(files: Mapping[str, str | Robot]) -> newton.ModelBuilder:
     """A world of robots and objects, declared or from MJCF texts, by name."""
-    template = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(template)
+    template = empty_builder()
     for name, text in files.items():
         if isinstance(text, Robot):
             text.add_to(template)
             continue
-        part = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(part)
+        part = empty_builder()
         part.add_mjcf(text, ctrl_direct=True)
         template.add_builder(part, label_prefix=name)
     return template

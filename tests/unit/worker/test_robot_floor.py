@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import newton
 import pytest
-from newton.solvers import SolverMuJoCo
 
-from tests.support.worker.robot_texts import BOX, HINGE, mjcf, read, twins
+from tests.support.worker.robot_texts import BOX, HINGE, mjcf, read, template, twins
 from worker.simulation.collisions import Collision
 from worker.simulation.robot import Robot
 from worker.simulation.worlds import Worlds
@@ -86,11 +84,8 @@ def test_a_floor_matters_only_as_far_as_the_task_follows_the_file() -> None:
 
 def height(file: str, ground: bool, **options: object) -> float:
     """Height of the robot after a second [m]."""
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
-    Robot(file, passive=True, **options).add_to(builder)  # type: ignore[arg-type]
     worlds = Worlds(
-        builder,
+        template(Robot(file, passive=True, **options)),  # type: ignore[arg-type]
         1,
         "cpu",
         timestep=0.002,

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
-import newton
 import numpy as np
 import pytest
-from newton.solvers import SolverMuJoCo
 
-from tests.support.worker.robot_texts import BOX, HINGE, SECOND, SITE, mjcf, read, twins
+from tests.support.worker.robot_texts import BOX, HINGE, SECOND, SITE, mjcf, read, template, twins
 from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation import robot_comparison as robot_judge
 from worker.simulation.robot import Robot
@@ -200,9 +198,7 @@ def test_sites_that_an_equality_pulls_together_are_held_where_they_are_together_
 
 def test_worlds_move_such_a_robot_as_mujoco_does() -> None:
     robot = Robot(OTHERWISE["another anchor of each joint"])
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
-    robot.add_to(builder)
+    builder = template(robot)
     view = RobotView(builder)
     assert view.body_names == ["b"] and view.joint_names == ["j", "k"]
     worlds = Worlds(
@@ -260,10 +256,7 @@ def test_numbers_of_joints_are_finite(name: str) -> None:
 
 def test_a_default_pose_beyond_the_limits_is_noted() -> None:
     limited = mjcf(f'<joint name="j" axis="0 1 0" range="-60 60"/>{BOX}')
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
-    Robot(limited, joint_positions={"j": 3.0}).add_to(builder)
-    assert RobotView(builder).beyond_limits() == [
+    assert RobotView(template(Robot(limited, joint_positions={"j": 3.0}))).beyond_limits() == [
         "joint j: its default position 3 lies outside its limits, -1.0472 to 1.0472"
     ]
 

@@ -10,9 +10,9 @@ import newton
 import pytest
 import torch
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from tests.support.refusals import refusal
+from tests.support.worker.robot_texts import template
 from worker.simulation.actuators import (
     DCMotorActuator,
     EffortActuator,
@@ -23,6 +23,7 @@ from worker.simulation.actuators import (
 from worker.simulation.collisions import Collision
 from worker.simulation.objects import Box, Capsule, Sphere
 from worker.simulation.robot import Robot
+from worker.simulation.robot_elements import empty_builder
 from worker.simulation.robot_view import RobotView
 from worker.simulation.worlds import Worlds
 
@@ -35,14 +36,6 @@ LEG = """<mujoco model="leg">{assets}<worldbody><body name="thigh" pos="0 0 1"><
 
 def leg(assets: str = "", geoms: str = "", actuators: str = "") -> str:
     return LEG.format(assets=assets, geoms=geoms, actuators=actuators)
-
-
-def template(*items: Any) -> newton.ModelBuilder:
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
-    for item in items:
-        item.add_to(builder)
-    return builder
 
 
 def build(*items: Any) -> Callable[[], Any]:
@@ -204,8 +197,7 @@ MIXED = '<motor joint="knee"/><position joint="hinge"/>'
 
 def worlds_of(add: Callable[[newton.ModelBuilder], Any], **options: Any) -> Worlds:
     """Two worlds of what is added to an empty builder."""
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
+    builder = empty_builder()
     add(builder)
     solver = {"disable_contacts": True, "njmax": 4, "nconmax": 0, **options}
     return Worlds(builder, 2, "cpu", timestep=1 / 120, substeps=2, fastest=1e3, ground=False, solver_options=solver)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import mujoco
-import newton
 import numpy as np
 import pytest
-from newton.solvers import SolverMuJoCo
 
 from tests.support.worker.robot_texts import BOX, HINGE, SECOND, mjcf, read, twins
 from worker.simulation.robot import Robot
+from worker.simulation.robot_elements import empty_builder
 from worker.simulation.solver import Solver
 from worker.simulation.worlds import Worlds
 
@@ -68,8 +67,7 @@ SOFT = {
 
 def stepped(file: str, control: float) -> tuple[Any, Any]:
     """Coordinates of a file's joints after half a second, of a world's own step and of MuJoCo's."""
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
+    builder = empty_builder()
     reading = Robot(file, passive=True).add_to(builder)
     options = {"njmax": 50, "nconmax": 20}
     worlds = Worlds(builder, 2, "cpu", timestep=0.002, substeps=250, fastest=1e9, solver_options=options)

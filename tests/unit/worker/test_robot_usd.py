@@ -9,8 +9,8 @@ from typing import Any
 import newton
 import numpy as np
 import pytest
-from newton.solvers import SolverMuJoCo
 
+from tests.support.worker.robot_texts import template
 from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation.robot import Robot
 from worker.simulation.robot_reading import Reading
@@ -87,10 +87,10 @@ def read(file: str, **options: Any) -> Reading:
     return Robot(file, passive=True, **options).read()
 
 
-def stepped(template: newton.ModelBuilder) -> Worlds:
+def stepped(scene: newton.ModelBuilder) -> Worlds:
     """One world without a ground, of 50 control steps a second."""
     options = {"disable_contacts": True}
-    return Worlds(template, 1, "cpu", timestep=0.002, substeps=10, fastest=False, ground=False, solver_options=options)
+    return Worlds(scene, 1, "cpu", timestep=0.002, substeps=10, fastest=False, ground=False, solver_options=options)
 
 
 def corrected(reading: Reading) -> list[str]:
@@ -286,13 +286,11 @@ def _flags(reading: Reading) -> tuple[list[str], list[int]]:
 
 
 def test_drives_become_actuators_whose_input_is_the_target(tmp_path: Path) -> None:
-    template = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(template)
-    Robot(usd(tmp_path, joint=DRIVE), fixed=True).add_to(template)
-    view = RobotView(template)
+    scene = template(Robot(usd(tmp_path, joint=DRIVE), fixed=True))
+    view = RobotView(scene)
     assert (view.actuators, view.inputs, view.efforts) == ([0], ["position"], [7.0])
     assert view.gains == pytest.approx([math.degrees(10.0)])
-    worlds = stepped(template)
+    worlds = stepped(scene)
     worlds.arrays.controls.fill_(0.5)
     for _ in range(100):
         worlds.simulate()
@@ -301,10 +299,7 @@ def test_drives_become_actuators_whose_input_is_the_target(tmp_path: Path) -> No
 
 
 def test_a_kinematic_root_stays_where_it_is(tmp_path: Path) -> None:
-    template = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(template)
-    Robot(usd(tmp_path, base="bool physics:kinematicEnabled = 1", joint=DRIVE)).add_to(template)
-    worlds = stepped(template)
+    worlds = stepped(template(Robot(usd(tmp_path, base="bool physics:kinematicEnabled = 1", joint=DRIVE))))
     for _ in range(10):
         worlds.simulate()
     assert abs(worlds.arrays.joint_q.numpy()[0, :3]).max() < 1e-3

@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Self
 
 import newton
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
 from worker.settings.task import TaskConfig
 from worker.simulation.randomization_targets import check_patterns
+from worker.simulation.robot_elements import empty_builder
 from worker.simulation.robot_reading import Reading
 from worker.simulation.robot_view import RobotView
 from worker.simulation.terrain import Terrain
@@ -99,8 +99,7 @@ class TaskSketch(TaskReport):
         return task
 
     def _template(self) -> newton.ModelBuilder:
-        template = newton.ModelBuilder()
-        SolverMuJoCo.register_custom_attributes(template)
+        template = empty_builder()
         self.build(template)
         return template
 
