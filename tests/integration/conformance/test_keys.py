@@ -10,20 +10,12 @@ import stat
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
-from starlette.applications import Starlette
-from starlette.requests import Request
-from starlette.responses import JSONResponse
-from starlette.routing import Route
 
-from orchestrator.api.http.access import Access
-from orchestrator.api.http.auth import Guard
 from orchestrator.api.http.callers import Caller
 from orchestrator.api.http.limits import RateLimit
-from orchestrator.api.http.requests import actor_of
 from orchestrator.domain.errors import ServerError
 from orchestrator.home import HomeLock
 from orchestrator.persistence.batch_models import JobQueue
@@ -32,7 +24,7 @@ from orchestrator.server import Server
 from tests.conftest import PATIENCE, Serving, call_muster, run_muster, wait_for
 from tests.support.conformance.keys import client, refused
 from tests.support.conformance.streams import client_of
-from tests.support.keys import HomeKeys, key_store
+from tests.support.keys import HomeKeys
 
 
 def test_the_command_shows_a_secret_once_and_the_home_keeps_it_sealed(tmp_path: Path) -> None:
@@ -188,28 +180,6 @@ def test_a_home_is_its_users_alone_and_an_open_one_is_closed(tmp_path: Path, cap
         assert found == dict.fromkeys(("muster.db", "muster.db-wal", "muster.db-shm", "muster.db.lock"), 0o600)
     finally:
         os.umask(before)
-
-
-def test_the_application_sees_who_asks(tmp_path: Path) -> None:
-    store = key_store(tmp_path)
-    key = store.create("a", ("robots",), read_only=True)
-
-    def who(request: Request) -> JSONResponse:  # in another thread, as all our operations are
-        actor = actor_of(request)
-        return JSONResponse([actor.name, sorted(actor.queues or ()), actor.read_only])
-
-    inner = Starlette(routes=[Route("/", who)])
-
-    async def ask(access: Access, token: str) -> Any:
-        transport = httpx.ASGITransport(Guard(inner, access, RateLimit()))
-        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as http:
-            return (await http.get("/", headers={"Authorization": f"Bearer {token}"})).json()
-
-    access = Access(store, "the-token")
-    assert asyncio.run(ask(access, f"{key.access_key_id}:{key.secret}")) == ["key a", ["robots"], True]
-    assert asyncio.run(ask(access, "the-token")) == ["MUSTER_TOKEN", [], False]
-    assert asyncio.run(ask(access, access.own_token)) == ["this process", [], False]
-    assert asyncio.run(ask(Access(), "any")) == ["address 127.0.0.1", [], False]
 
 
 def test_muster_run_gets_into_the_controller_that_it_brings(tmp_path: Path) -> None:
