@@ -77,7 +77,7 @@ class Resource:
         return [value if isinstance(value, Text) else "" if value is None else str(value) for value in values]
 
     def show(self, rows: Sequence[Row], as_json: bool = False) -> None:
-        """Print the rows as JSON, as a table, or that there are none."""
+        """Print the rows as JSON, as a table, or :attr:`empty`."""
         if as_json:
             echo_json(rows, indent=1)
         elif rows:

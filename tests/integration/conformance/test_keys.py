@@ -151,7 +151,7 @@ def test_a_home_is_its_users_alone_and_an_open_one_is_closed(tmp_path: Path, cap
             (tmp_path / name).mkdir(mode=0o755)
         (tmp_path / "older" / "controller.lock").touch()
         (tmp_path / "older" / "muster.db").touch(mode=0o644)
-        (tmp_path / "shared" / "of somebody").touch()
+        (tmp_path / "shared" / "of another").touch()
         for name, mode, words in (("older", 0o700, "it is closed to them now"), ("shared", 0o755, "run chmod 700")):
             HomeLock(tmp_path / name).release()
             assert stat.S_IMODE((tmp_path / name).stat().st_mode) == mode
@@ -165,13 +165,13 @@ def test_a_home_is_its_users_alone_and_an_open_one_is_closed(tmp_path: Path, cap
         (tmp_path / "shared" / "kernels").symlink_to(tmp_path / "elsewhere")
         HomeLock(tmp_path / "shared").release()
         modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in (tmp_path / "shared").iterdir()}
-        assert {name: modes[name] for name in ("store", "ray", "supervisors", "kernels", "of somebody")} == {
+        assert {name: modes[name] for name in ("store", "ray", "supervisors", "kernels", "of another")} == {
             **dict.fromkeys(("store", "ray", "supervisors"), 0o700),
             "kernels": 0o755,  # it lies elsewhere, and may be shared
-            "of somebody": 0o644,
+            "of another": 0o644,
         }
         output = caplog.records[0].message
-        assert "since it also holds 'of somebody'" in output and "Muster's directories in it are closed" in output
+        assert "since it also holds 'of another'" in output and "Muster's directories in it are closed" in output
         database = Database.at(tmp_path / "older")
         with database.session() as session:
             session.add(JobQueue(name="x", compute_environments=[]))
@@ -241,7 +241,7 @@ def as_nobody(script: str, *arguments: str) -> str:
 
 
 @as_root
-def test_another_user_of_the_machine_is_told_to_ask_for_a_key(shared_server: Serving) -> None:
+def test_another_user_of_the_machine_is_advised_to_ask_for_a_key(shared_server: Serving) -> None:
     client_of(shared_server.url, "batch").list_jobs(jobQueue="default")  # the own user, with any credentials
     script = """
 connection = http.client.HTTPConnection(sys.argv[1])

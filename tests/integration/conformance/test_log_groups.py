@@ -189,7 +189,7 @@ def test_every_option_of_the_driver_is_taken(batch: Batch, own: str) -> None:
 # -- the groups -------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_there_already_is_said_as_aws_says_it(logs: Any, own: str) -> None:
+def test_what_exists_already_is_refused_as_on_aws(logs: Any, own: str) -> None:
     for name in (GROUP, own):
         if name == own:
             logs.create_log_group(logGroupName=own)

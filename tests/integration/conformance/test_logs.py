@@ -27,7 +27,7 @@ def counted(shared_server: Serving) -> str:
 
 @pytest.fixture
 def quiet(shared_server: Serving) -> str:
-    """A job that is over and printed one line; what its supervisor said at the end is not part of the stream."""
+    """A job that is over and printed one line; its supervisor's last line is not part of the stream."""
     return finished(shared_server, "print('quiet')", name="quiet")
 
 

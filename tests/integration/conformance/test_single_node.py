@@ -329,7 +329,7 @@ def test_a_gang_that_the_engine_refuses_has_aws_s_reasons(batch: Batch) -> None:
     assert batch.server.client.get(f"/api/jobs/{job}")["statusReason"] == f"can't start the gang: {own}"
 
 
-def test_a_host_that_is_lost_is_told_from_a_program_that_failed(batch: Batch, tmp_path: Path) -> None:
+def test_a_host_that_is_lost_differs_from_a_program_that_failed(batch: Batch, tmp_path: Path) -> None:
     """The pattern that many clients use: again where the host went away, not where the program failed."""
     script = f"[ {ATTEMPT} = 1 ] || exit 3; echo $PPID > $GATE/pid.new; mv $GATE/pid.new $GATE/pid; exec sleep 600"
     conditions = [

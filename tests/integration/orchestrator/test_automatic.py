@@ -223,7 +223,9 @@ def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_
     assert controller.evaluations() == []
 
 
-def test_an_evaluation_that_its_queue_refuses_is_told(controller: Controller, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_evaluation_that_its_queue_refuses_is_reported(
+    controller: Controller, caplog: pytest.LogCaptureFixture
+) -> None:
     order = [{"order": 1, "computeEnvironment": "local"}]
     controller.client.batch("CreateJobQueue", jobQueueName="idle", priority=1, computeEnvironmentOrder=order)
     controller.train({"every": 1, "queue": "idle"})

@@ -85,7 +85,7 @@ def test_commands_without_a_controller_say_how_to_start_one_and_take_no_other(tm
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8080", "localhost:8080", "http://127.0.0.1:80800", "http://", "ftp://x"])
-def test_an_address_that_is_no_url_is_wrong_use(tmp_path: Path, url: str) -> None:
+def test_an_address_that_is_not_a_url_is_wrong_use(tmp_path: Path, url: str) -> None:
     refused(["list"], tmp_path, 2, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
 
 
@@ -211,7 +211,7 @@ def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Se
     refused(["resume", server.detail(job["jobId"])["run"]], server.home, 2, never)
 
 
-def test_who_follows_a_log_is_told_again_when_the_reason_changes(server: Serving, tmp_path: Path) -> None:
+def test_who_follows_a_log_is_notified_again_when_the_reason_changes(server: Serving, tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     script = f"import os, signal, time\nsignal.signal(15, signal.SIG_IGN)\nwhile not os.path.exists({str(gate)!r}): time.sleep(0.05)"
     server.wait(full := server.gang(script, cpus="4"), "RUNNING")

@@ -122,7 +122,7 @@ def damaged(store: Store) -> None:
 
 
 @pytest.mark.parametrize("line", REFUSED)
-def test_what_can_not_be_is_refused_by_name(full: Serving, damaged: None, line: str) -> None:
+def test_what_cannot_be_is_refused_by_name(full: Serving, damaged: None, line: str) -> None:
     words = shlex.split(line)
     words += [] if "--name" in words else ["--name", "x"]
     assert re.search(REFUSED[line], refusal(full, "clone", *words, code=1 if line in CONFLICTS else 2))

@@ -199,7 +199,7 @@ def test_a_job_has_the_limit_of_open_files_that_the_controller_was_started_with(
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_clients_that_take_no_answer_give_way_or_a_new_one_is_told(
+def test_clients_that_take_no_answer_give_way_or_a_new_one_is_refused(
     inside: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held: connections.Connections = inside._uvicorn.config.http.args[0]

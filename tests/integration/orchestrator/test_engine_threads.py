@@ -1,4 +1,4 @@
-"""Engines that hang, fail, are full, or queue by themselves: each on its own thread, none in the way of another; what is told of them."""
+"""Engines that hang, fail, are full, or queue by themselves: each on its own thread, none in the way of another; and what is reported of them."""
 
 from __future__ import annotations
 
@@ -302,9 +302,7 @@ def test_gangs_are_handed_over_although_others_run_there(queued: Client, engine:
     assert len(engine.cluster.launched) == 3 and hosts == {"fake/q"}
 
 
-def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_told_apart_from_hosts(
-    queued: Client, engine: FakeEngine
-) -> None:
+def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_a_host(queued: Client, engine: FakeEngine) -> None:
     limit = "queue fake/q gives a gang at most 8 CPUs, 2 GPUs, 8 GiB"
     for nodes, cpus, needs in (
         (1, "12", "each node needs 12 CPUs, 0 GPUs, 64 MiB"),

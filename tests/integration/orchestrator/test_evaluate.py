@@ -67,7 +67,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("line", REFUSED)
-def test_what_can_not_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
+def test_what_cannot_be_is_refused_at_submission_in_one_line(full: Serving, line: str) -> None:
     assert REFUSED[line] in refusal(full, "evaluate", *shlex.split(line))
 
 
@@ -127,7 +127,7 @@ def test_compare_puts_seeds_into_one_group_and_draws_curves(full: Serving, tmp_p
     assert rows[0] == "taught,100.0,10.0,0.0,1" and rows[-1] == "slow,900.0,3.0,0.0,1"
 
 
-def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) -> None:
+def test_compare_refuses_what_it_cannot_compare(full: Serving, tmp_path: Path) -> None:
     for options, output in (
         (["taught"], "that is one run, taught; name two or more to compare"),
         (["taught", "slwo"], "did you mean slow"),

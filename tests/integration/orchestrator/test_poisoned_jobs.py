@@ -136,7 +136,7 @@ def test_an_engine_that_wants_to_end_the_process_ends_neither_its_thread_nor_the
 
 
 HALF = "a name with half a character: \udcff"
-"""As the name of a file has it that is no UTF-8: no database can store it."""
+"""As the name of a file has it that isn't UTF-8: no database can store it."""
 
 
 def test_a_container_that_the_engine_can_t_start_fails_each_attempt_and_rules_see_aws_s_reasons(bench: Bench) -> None:
@@ -238,8 +238,8 @@ def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, mo
         bench.explains("job", "no room yet")
         engine.error = None
         assert bench.wait("job", Status.RUNNING).status_reason == "attempt 1 runs on 2 nodes"
-        gangs["job/1/1"][0] = NodeStatus(NodePhase.UNREACHABLE, words="out of sight")
-        bench.explains("job", "out of sight")
+        gangs["job/1/1"][0] = NodeStatus(NodePhase.UNREACHABLE, words="unreachable now")
+        bench.explains("job", "unreachable now")
         engine.cluster.end("job/1/1", 1, 3)
         bench.explains("job", "attempt 2 runs on 2 nodes")
         with bench.database.session() as session:
@@ -263,7 +263,7 @@ def test_what_another_controller_changed_meanwhile_counts_once_the_database_is_b
     bench.controller._kept = 0.0
     with mock.patch.object(database, "keep_lock", side_effect=DatabaseError("another controller has it")):
         wait_for(lambda: bench.controller.trouble, 20, "that the lock is missed")
-        with database.engine.begin() as other:  # as the other controller does: this one is not told
+        with database.engine.begin() as other:  # as the other controller does: this one is not notified
             other.execute(update(Job).where(Job.id == "a").values(stop_reason="enough"))
             moment = {"stopped_at": 1, "ending": "stopped", "spent": True}
             other.execute(update(Attempt).where(Attempt.job_id == "b").values(**moment))

@@ -50,7 +50,7 @@ def test_no_text_can_end_an_event_or_begin_another() -> None:
     assert json.loads(lines[1].removeprefix("data: ")) == event.data
 
 
-def test_a_look_that_fails_is_told_and_the_stream_goes_on_to_its_end() -> None:
+def test_a_look_that_fails_is_reported_and_the_stream_goes_on_to_its_end() -> None:
     def failing() -> Sequence[ServerSentEvent]:
         raise ClientError("the run is gone")
 
