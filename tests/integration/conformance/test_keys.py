@@ -13,6 +13,7 @@ from pathlib import Path
 
 import httpx
 import pytest
+from botocore.exceptions import ClientError
 
 from orchestrator.api.http.callers import Caller
 from orchestrator.api.http.limits import RateLimit
@@ -73,7 +74,7 @@ def test_the_database_of_the_keys_is_the_one_that_the_controller_is_given(tmp_pa
     assert [each["name"] for each in json.loads(listed)] == ["before", "a"] and not (tmp_path / "muster.db").exists()
 
 
-def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
+def test_keys_come_and_go_without_a_restart_and_deleting_the_last_one_opens_nothing(tmp_path: Path) -> None:
     store = HomeKeys(tmp_path)
 
     def is_refused(url: str) -> bool:
@@ -86,10 +87,21 @@ def test_deleting_the_last_key_opens_nothing(tmp_path: Path) -> None:
         wait_for(lambda: is_refused(server.url), what="the server's look at the keys")
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
+        made = call_muster("keys", "create", "b", "--queue", "robots", "--queue", "default", home=tmp_path)
+        other = next(each for each in store.load().values() if each.name == "b")
+        assert other.queues == ("robots", "default") and made.returncode == 0, made.stderr
+        assert f"export MUSTER_TOKEN={other.access_key_id}:{other.secret}" in made.stdout
+        client(server.url, other.access_key_id, other.secret).list_jobs(jobQueue="default")
+        assert call_muster("keys", "delete", "b", home=tmp_path).returncode == 0
         done = call_muster("keys", "delete", "a", home=tmp_path)
         assert "deleted key a\nthis was the last key" in done.stdout, done.stdout
         assert "its own user's requests on loopback" in done.stdout and "does not start without a key" in done.stdout
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
+        for each in (other, key):
+            bearer = {"Authorization": f"Bearer {each.access_key_id}:{each.secret}"}
+            wait_for(lambda sent=bearer: httpx.get(f"{server.url}/api/runs", headers=sent).status_code == 403)
+            with pytest.raises(ClientError, match="UnrecognizedClientException"):
+                client(server.url, each.access_key_id, each.secret).list_jobs(jobQueue="default")
 
 
 def test_off_loopback_a_key_is_demanded_and_other_web_pages_are_refused(tmp_path: Path) -> None:

@@ -74,14 +74,6 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving, tm
         assert [line["text"] for line in followed if line["rank"] == rank] == [f"tick {i}" for i in range(60)]
 
 
-def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_server: Serving, tmp_path: Path) -> None:
-    lines = "\n".join(f"print('line {i}')\n{until(tmp_path / str(i))}" for i in range(3))
-    job = shared_server.gang(f"import time\n{lines}")
-    texts = []
-    for line in shared_server.client.logs(job, follow=True):
-        texts.append(line["text"])
-        (tmp_path / texts[-1].removeprefix("line ")).touch()  # the next one is printed once this one has come
-    assert texts == [f"line {i}" for i in range(3)] + ["node 0 ended: done"]
 
 
 STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); {FOREVER}"
