@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from orchestrator.cli.command_options import (
     CpusOption,
@@ -20,13 +19,14 @@ from orchestrator.cli.command_options import (
     split_model,
 )
 from orchestrator.cli.controllers import controller, see_through
+from orchestrator.cli.listings import Resource, show_facts
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
-from orchestrator.cli.progress import summary
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.progress import await_end
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, NotServing, UsageError
-from racer.control.league_table import COLUMNS, cells, write
+from racer.control.league_table import TABLE, write
 from racer.store.leagues import moment
 from racer.store.races import clock
 from racer.store.standings import RANKINGS, differences
@@ -50,7 +50,7 @@ def register(app: typer.Typer) -> None:
     group.command(
         "create", epilog="Example:  muster league create cup --track oval --ranking best --closes 2026-12-24T18:00"
     )(create)
-    group.command("list", epilog="Example:  muster league list --json")(list_leagues)
+    _LEAGUES.add_list(group, "List the leagues with their rules.", "Example:  muster league list --json")
     group.command("show", epilog="Example:  muster league show cup     or, an entry:  muster league show cup 3")(show)
     group.command("submit", epilog="Example:  muster league submit cup fast@2 --as ada")(submit)
     group.command("table", epilog="Example:  muster league table cup -o cup.csv")(show_table)
@@ -139,33 +139,38 @@ def _moment(option: str, text: str | None) -> float | None:
         raise UsageError(f"{option} {text}: expected a time such as 2026-12-24T18:00, or 2026-12-24T18:00Z") from None
 
 
-def list_leagues(store: StoreOption = None, as_json: JsonOption = False) -> None:
-    """List the leagues with their rules."""
-    with controller(store, None) as connect:
-        found = connect().get("/api/leagues")
-    if as_json:
-        echo_json(found, indent=1)
-        return
-    if not found:
-        echo("no league was created yet; muster league create NAME --track oval")
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("LEAGUE", "TRACK", "LAPS", "RANKING", "ENTRIES", "OWNER", "STATE"):
-        table.add_column(column, no_wrap=True)
-    for each in found:
-        if "problem" in each:
-            table.add_row(each["name"], *["-"] * 5, each["problem"])
-            continue
-        rules = each["rules"]
-        measures = (str(rules["laps"]), rules["ranking"], str(each["entries"]), each["owner"])
-        table.add_row(each["name"], ", ".join(each["track"]), *measures, _state(each))
-    print_cut(table)
-
-
 def _state(league: Mapping[str, Any]) -> str:
     if league["closed"]:
         return str(league["closed"]).removeprefix(f"league {league['name']} ")
     return f"open until {moment(league['closes'])}" if league["closes"] else "open"
+
+
+_LEAGUES = Resource(
+    {
+        "LEAGUE": "name",
+        "TRACK": lambda league: ", ".join(league["track"]),
+        "LAPS": lambda league: league["rules"]["laps"],
+        "RANKING": lambda league: league["rules"]["ranking"],
+        "ENTRIES": "entries",
+        "OWNER": "owner",
+        "STATE": _state,
+    },
+    "no league was created yet; muster league create NAME --track oval",
+    "/api/leagues",
+    problem=("problem", ""),
+)
+_LAPS = Resource(
+    {
+        "LAP": "trial",
+        "TIME": lambda lap: clock(lap.get("time")),
+        "PENALTY": lambda lap: f"{lap.get('penalty') or 0:g} s",
+        "COMPLETE": lambda lap: f"{lap.get('completion') or 0:.1f} %",
+        "OFF-TRACKS": "off_tracks",
+        "CRASHES": "crashes",
+        "RESETS": "resets",
+        "STATUS": "status",
+    }
+)
 
 
 def show(
@@ -189,35 +194,34 @@ def _print_league(league: Mapping[str, Any]) -> None:
     rules = league["rules"]
     counts = {"total": "the time of all laps", "best": "the best lap", "average": "the mean of the complete laps"}
     echo(f"{league['name']}: {counted(rules['laps'], 'lap')} on {', '.join(league['track'])}; {_state(league)}")
-    echo(f"  ranked by:  {counts[rules['ranking']]}")
+    continuous = "no, a car that leaves the road has ended its lap"
     if rules["continuous"]:
         penalties = f"{rules['off_track_penalty']:g} s off the track, {rules['crash_penalty']:g} s for a crash"
-        echo(f"  continuous: put back at most {counted(rules['max_resets'], 'time')} in a lap; {penalties}")
-    else:
-        echo("  continuous: no, a car that leaves the road has ended its lap")
-    echo(f"  lap:        at most {rules['seconds']:g} s, seed {league['seed']}")
+        continuous = f"put back at most {counted(rules['max_resets'], 'time')} in a lap; {penalties}"
     most = counted(league["most_entries"], "entry", "entries")
-    echo(f"  entries:    {league['entries']}; at most {most} of each key or user")
-    echo(f"  created:    {moment(league['created'])} by {league['owner']}")
-    echo(f"  digest:     {league['digest']}")
+    facts = {
+        "ranked by": counts[rules["ranking"]],
+        "continuous": continuous,
+        "lap": f"at most {rules['seconds']:g} s, seed {league['seed']}",
+        "entries": f"{league['entries']}; at most {most} of each key or user",
+        "created": f"{moment(league['created'])} by {league['owner']}",
+        "digest": league["digest"],
+    }
+    show_facts(facts, 11)
 
 
 def _print_entry(entry: Mapping[str, Any]) -> None:
     if "race" in entry:
         model, evaluation = entry["model"], entry["evaluation"]
         echo(f"entry {entry['entry']}: {entry['racer']} with {model['name']}@{model['version']} ({model['task']})")
-        table = Table(box=None, pad_edge=False)
-        for column in ("LAP", "TIME", "PENALTY", "COMPLETE", "OFF-TRACKS", "CRASHES", "RESETS", "STATUS"):
-            table.add_column(column, no_wrap=True)
-        for each in entry["race"]["trials"]:
-            counts = (str(each.get(key)) for key in ("off_tracks", "crashes", "resets"))
-            times = (clock(each.get("time")), f"{each.get('penalty') or 0:g} s", f"{each.get('completion') or 0:.1f} %")
-            table.add_row(str(each["trial"]), *times, *counts, each["status"])
-        print_cut(table)
-        echo(f"  entered:     {moment(entry['entered'])} by {entry['owner']}")
-        echo(f"  evaluation:  {evaluation['name']} of run {evaluation['run']}, job {evaluation['job']}")
-        echo(f"  model:       {model['digest']}")
-        echo(f"  digest:      {entry['digest']}")
+        _LAPS.show(entry["race"]["trials"])
+        facts = {
+            "entered": f"{moment(entry['entered'])} by {entry['owner']}",
+            "evaluation": f"{evaluation['name']} of run {evaluation['run']}, job {evaluation['job']}",
+            "model": model["digest"],
+            "digest": entry["digest"],
+        }
+        show_facts(facts, 12)
     if ruling := entry.get("ruling"):
         echo(f"  disqualified: {ruling['reason']}")
     if entry.get("problem"):
@@ -260,7 +264,7 @@ def submit(
         client = connect()
         if evaluation is None:
             started = client.post(f"{path}/races", body, seconds=300, once=True)
-            code = see_through(client, started["jobId"], *([_quietly] if as_json else []))
+            code = see_through(client, started["jobId"], *([await_end] if as_json else []))
             if code:
                 raise typer.Exit(code)
             body["version"], evaluation = (
@@ -285,13 +289,6 @@ def _print_started(started: Mapping[str, Any], league: str, racer: str | None, a
     echo(f"submitted the race of {reference} as {started['jobId']}")
     name = f" --as '{racer}'" if racer else ""
     echo(f"enter it after it has ended: muster league submit {league} {reference}{name} --evaluation {job}")
-
-
-def _quietly(client: Client, job: str) -> int:
-    """Wait for a job, and print how it ended if it did not succeed. Returns the exit code."""
-    for _ in client.logs(job, follow=True):
-        pass
-    return 0 if client.get(f"/api/jobs/{job}")["status"] == "SUCCEEDED" else summary(client, job)
 
 
 def show_table(
@@ -320,12 +317,7 @@ def show_table(
     if not rows:
         echo(f"{league} has no entries yet; muster league submit {league} MODEL")
     else:
-        table = Table(box=None, pad_edge=False)
-        for column in COLUMNS:
-            table.add_column(column, no_wrap=True)
-        for row in rows:
-            table.add_row(*cells(row))
-        print_cut(table)
+        TABLE.show(rows)
     if output is not None:
         echo(f"written: {output}")
 
@@ -387,7 +379,7 @@ def _again(client: Client, path: str, entry: Mapping[str, Any]) -> list[str]:
         raise
     except ApiError as error:  # of this entry only: for example, its checkpoint was deleted
         return [str(error)]
-    if see_through(client, started["jobId"], _quietly):
+    if see_through(client, started["jobId"], await_end):
         return [f"its race was not driven again: job {started['jobId'][:8]} did not succeed"]
     listed = client.get(f"/api/runs/{named(started['run'])}/evaluations")
     again = next(each for each in listed if each.get("job") == started["jobId"])

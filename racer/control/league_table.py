@@ -1,4 +1,4 @@
-"""The table of a league: as cells, as CSV, and as a picture drawn without a display."""
+"""The table of a league: its columns, as CSV, and as a picture drawn without a display."""
 
 from __future__ import annotations
 
@@ -8,32 +8,33 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from orchestrator.cli.listings import Resource
 from orchestrator.domain.errors import UsageError
 from racer.store.races import clock
 from racer.store.standings import Row
 from shared_store.volume.files import write_atomic
 
-COLUMNS = ("RANK", "ENTRY", "RACER", "MODEL", "TIME", "BEST LAP", "LAPS", "OFF-TRACKS", "CRASHES", "RESETS", "STATUS")
-_NUMBERS = ("off_tracks", "crashes", "resets")
 
-
-def cells(row: Mapping[str, Any]) -> list[str]:
-    """A row of the table as text, one cell for each of :data:`COLUMNS`."""
-    laps = "-" if row["laps"] is None else f"{row['completed']} of {row['laps']}"
-    counts = ["-" if row[key] is None else str(row[key]) for key in _NUMBERS]
+def _status(row: Mapping[str, Any]) -> str:
     words = {"ranked": "ranked", "altered": row["reason"]}
-    status = words.get(row["status"]) or f"{row['status']}: {row['reason']}"
-    return [
-        str(row["rank"] or "-"),
-        str(row["entry"]),
-        row["racer"],
-        row["model"],
-        clock(row["time"]),
-        clock(row["best_lap"]),
-        laps,
-        *counts,
-        status,
-    ]
+    return words.get(row["status"]) or f"{row['status']}: {row['reason']}"
+
+
+TABLE = Resource(
+    {
+        "RANK": lambda row: row["rank"] or None,
+        "ENTRY": "entry",
+        "RACER": "racer",
+        "MODEL": "model",
+        "TIME": lambda row: clock(row["time"]),
+        "BEST LAP": lambda row: clock(row["best_lap"]),
+        "LAPS": lambda row: None if row["laps"] is None else f"{row['completed']} of {row['laps']}",
+        "OFF-TRACKS": "off_tracks",
+        "CRASHES": "crashes",
+        "RESETS": "resets",
+        "STATUS": _status,
+    }
+)
 
 
 def write(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], path: Path) -> None:
@@ -60,7 +61,7 @@ def _picture(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> by
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    shown = [[*cells(row)[:-1], row["status"]] for row in rows]
+    shown = [[*TABLE.texts(row)[:-1], row["status"]] for row in rows]
     figure = Figure(figsize=(11, 1.2 + 0.3 * len(shown)), dpi=120)
     FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -68,11 +69,13 @@ def _picture(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> by
     rules = league["rules"]
     title = f"{league['name']}: {rules['laps']} x {', '.join(league['track'])}, ranked by {rules['ranking']}"
     axes.set_title(title.replace("$", r"\$"), loc="left")
-    texts = [[each.replace("$", r"\$") for each in row] for row in (shown or [["-"] * len(COLUMNS)])]
-    table = axes.table(cellText=texts, colLabels=COLUMNS, cellLoc="left", loc="upper left", edges="horizontal")
+    texts = [[each.replace("$", r"\$") for each in row] for row in (shown or [["-"] * len(TABLE.columns)])]
+    table = axes.table(
+        cellText=texts, colLabels=list(TABLE.columns), cellLoc="left", loc="upper left", edges="horizontal"
+    )
     table.auto_set_font_size(False)
     table.set_fontsize(9)
-    table.auto_set_column_width(range(len(COLUMNS)))
+    table.auto_set_column_width(range(len(TABLE.columns)))
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight")
     return buffer.getvalue()

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
 from orchestrator.cli.command_options import JsonOption, OverwriteOption, StoreOption
 from orchestrator.cli.controllers import controller
+from orchestrator.cli.listings import Resource, date, show_facts
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
-from orchestrator.cli.terminal import echo, echo_json, print_cut
+from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.domain.errors import ServerError, UsageError
 from racer.control.track_orders import carry_out
 
@@ -47,20 +46,7 @@ def register(app: typer.Typer) -> None:
 
 def list_tracks(store: StoreOption = None, as_json: JsonOption = False) -> None:
     """List the presets and the tracks of the store, with their measures."""
-    found = _request({"action": "list"}, store)
-    if as_json:
-        echo_json(found, indent=1)
-        return
-    table = Table(box=None, pad_edge=False)
-    for column in ("TRACK", "LENGTH", "WIDTH", "RADIUS", "DIRECTION", "WAYPOINTS", "FROM"):
-        table.add_column(column, no_wrap=True)
-    for track in found:
-        if "problem" in track:
-            table.add_row(track["name"], *["-"] * 5, track["problem"])
-            continue
-        measures = (f"{track['length']:.2f} m", _width(track), f"{track['least_radius']:.2f} m", track["direction"])
-        table.add_row(track["name"], *measures, str(track["waypoints"]), _origin(track["origin"]))
-    print_cut(table)
+    _TRACKS.show(_request({"action": "list"}, store), as_json)
 
 
 def show(
@@ -149,18 +135,14 @@ def _print(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None
         echo_json(track, indent=1)
         return
     echo(f"{track['name']}: {track['length']:.2f} m long, {_width(track)} wide, {track['direction']}")
-    echo(f"  tightest:   a radius of {track['least_radius']:.2f} m")
-    steps = track["waypoints"] - (not track["closed"])
-    echo(f"  waypoints:  {track['waypoints']}, {track['length'] / steps:.3f} m apart")
-    if origin := track.get("origin"):
-        echo(f"  from:       {_origin(origin)}")
-        for note in origin.get("notes") or ():
-            echo(f"  mended:     {note}")
-    if created := track.get("created"):
-        echo(f"  kept:       {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(created))}")
-    echo(f"  digest:     {track['digest']}")
-    if path := track.get("path"):
-        echo(f"  lies in:    {path}")
+    steps, origin = track["waypoints"] - (not track["closed"]), track.get("origin") or {}
+    apart = f"{track['waypoints']}, {track['length'] / steps:.3f} m apart"
+    show_facts(
+        {"tightest": f"a radius of {track['least_radius']:.2f} m", "waypoints": apart, "from": _origin(origin)}, 11
+    )
+    for note in origin.get("notes") or ():
+        show_facts({"mended": note}, 11)
+    show_facts({"kept": date(track.get("created")), "digest": track["digest"], "lies in": track.get("path")}, 11)
     if output is not None:
         echo(f"written: {output}")
 
@@ -174,3 +156,17 @@ def _origin(origin: Mapping[str, Any]) -> str:
     """The origin of a track, then its settings."""
     keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
     return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)
+
+
+_TRACKS = Resource(
+    {
+        "TRACK": "name",
+        "LENGTH": lambda track: f"{track['length']:.2f} m",
+        "WIDTH": _width,
+        "RADIUS": lambda track: f"{track['least_radius']:.2f} m",
+        "DIRECTION": "direction",
+        "WAYPOINTS": "waypoints",
+        "FROM": lambda track: _origin(track["origin"]),
+    },
+    problem=("problem", ""),
+)

@@ -318,8 +318,6 @@ def test_as_terraform_manages_a_log_group(logs: Any, own: str) -> None:
         logs.list_tags_for_resource(resourceArn=arn)
 
 
-
-
 def test_as_covalent_runs_a_task(batch: Batch, logs: Any) -> None:
     """covalent-awsbatch-plugin: a definition with a log group of its own, its stream by the name that DescribeJobs tells."""
     options = {"awslogs-region": "us-east-1", "awslogs-group": "covalent-batch-job-logs"}

@@ -73,8 +73,6 @@ def definition(name: str, size: int = 0) -> dict[str, Any]:
     return multinode(name, container(env={"FILLING": "x" * size}))
 
 
-
-
 def test_a_wrong_secret_and_an_unknown_key_get_different_errors(served: Serving, key: Key) -> None:
     with pytest.raises(ClientError, match="does not match the signature") as wrong:
         client(served.url, key.access_key_id, key.secret[::-1]).list_jobs(jobQueue="default")
@@ -203,8 +201,6 @@ def test_a_read_only_key_may_only_read(served: Serving, home: Path) -> None:
     assert httpx.get(f"{served.url}/api/runs", headers=bearer).status_code == 200
     for path in ("/api/runs/x/resume", "/v1/SubmitJob", "/v1/describe/../submitjob", "/v1/getx%2Fy", "//v1/listjobs"):
         refused(httpx.post(served.url + path, headers=bearer, json={}), "AccessDeniedException")
-
-
 
 
 def test_a_key_for_one_queue_changes_no_tag_of_what_others_depend_on(served: Serving, home: Path) -> None:

@@ -74,8 +74,6 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving, tm
         assert [line["text"] for line in followed if line["rank"] == rank] == [f"tick {i}" for i in range(60)]
 
 
-
-
 STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); {FOREVER}"
 ASLEEP = f"import os; print('pid', os.getpid(), os.getppid(), flush=True); {FOREVER}"
 
