@@ -20,7 +20,7 @@ class ServiceManager:
         period, process = environment.pop("WATCHDOG_USEC", ""), environment.pop("WATCHDOG_PID", "")
         is_watched = period.isdecimal() and process in ("", str(os.getpid()))
         self.interval = int(period) / 2e6 if is_watched else None
-        """Seconds between two signs of life: half of what the manager allows; None where it expects none."""
+        """Seconds between two heartbeats: half of what the manager allows; None where it expects none."""
 
     def notify(self, state: str) -> None:
         """Send ``READY=1``, ``WATCHDOG=1`` or ``STOPPING=1``. Nothing happens where the manager is gone."""
@@ -30,7 +30,7 @@ class ServiceManager:
                 sender.sendto(state.encode(), self._address)
 
     def keep_alive(self, is_alive: Callable[[], bool], wait: Callable[[float], bool]) -> None:
-        """Send signs of life from another thread while ``is_alive``.
+        """Send heartbeats from another thread while ``is_alive``.
 
         ``wait``: waits so many seconds, and returns True where the controller ends.
         """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -64,56 +63,44 @@ def evaluate(
     run's evaluations/ gets a Parquet file with one row per episode, and a summary. The job has one node, with the resources of the run's
     nodes, but at most one GPU.
     """
-    section = {
-        "episodes": episodes,
-        "worlds": worlds,
-        "seed": seed,
-        "accept_changed_robot": accept_changed_robot or None,
-    }
-    request = EvaluationRequest(
-        source, section, set_ or (), name, engine, store, cpus, as_json, queue=queue, follow=follow, dry_run=dry_run
-    )
-    raise typer.Exit(follow_evaluation(request))
+    section = {"episodes": episodes, "worlds": worlds, "seed": seed}
+    section["accept_changed_robot"] = accept_changed_robot or None
+    modes: dict[str, Any] = {"queue": queue, "engine": engine, "store": store, "cpus": cpus}
+    modes |= {"follow": follow, "dry_run": dry_run, "as_json": as_json}
+    raise typer.Exit(follow_evaluation(source, section, set_, name, **modes))
 
 
-@dataclass(frozen=True)
-class EvaluationRequest:
-    """The request of a user for an evaluation.
+def follow_evaluation(
+    source: str,
+    section: Mapping[str, Any],
+    changes: Sequence[str] | None,
+    name: str | None,
+    *,
+    queue: str | None,
+    engine: str | None,
+    store: str | None,
+    cpus: float | None,
+    follow: bool,
+    dry_run: bool,
+    as_json: bool,
+    kind: str = "evaluate",
+    then: Callable[[Path, str], None] | None = None,
+) -> int:
+    """Submit an evaluation and follow it to its end.
 
-    Attributes:
+    Args:
         source: ``RUN[@ITERATION|@best|@latest]``.
         section: Of the job, beside run and checkpoint; None is left out.
         changes: ``key=value``, of the worlds or of the job.
         name: Of the job; KIND-RUN where None.
+        queue: Of the job; that of its training where None.
         engine: That runs the job.
         store: Of a temporary controller.
         cpus: Of a temporary controller.
-        as_json: Whether the summary is printed as JSON.
-        kind: Key of the job's section.
-        queue: Of the job; that of its training where None.
         follow: Whether the command waits for the end of the job.
         dry_run: Whether nothing is submitted.
-    """
-
-    source: str
-    section: Mapping[str, Any]
-    changes: Sequence[str] = ()
-    name: str | None = None
-    engine: str | None = None
-    store: str | None = None
-    cpus: float | None = None
-    as_json: bool = False
-    kind: str = "evaluate"
-    queue: str | None = None
-    follow: bool = True
-    dry_run: bool = False
-
-
-def follow_evaluation(request: EvaluationRequest, then: Callable[[Path, str], None] | None = None) -> int:
-    """Submit an evaluation and follow it to its end.
-
-    Args:
-        request: The evaluation.
+        as_json: Whether the summary is printed as JSON.
+        kind: Key of the job's section.
         then: Called after success with the run's directory and the evaluation's name.
 
     Returns:
@@ -122,35 +109,34 @@ def follow_evaluation(request: EvaluationRequest, then: Callable[[Path, str], No
     Raises:
         UsageError, SpecError, ApiError, ServerError: One line each.
     """
-    run, checkpoint = options.split_reference(request.source)
-    section = {key: value for key, value in {"checkpoint": checkpoint, **request.section}.items() if value is not None}
-    with controller(request.store, request.cpus) as connect:
+    run, checkpoint = options.split_reference(source)
+    section = {key: value for key, value in {"checkpoint": checkpoint, **section}.items() if value is not None}
+    worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in changes or ()]
+    with controller(store, cpus) as connect:
         client = connect()
-        elsewhere = queue_change(client, request.changes, request.queue, request.engine)
-        spec = _spec(client, named(run), request, section, elsewhere)
-        modes = {"follows": request.follow, "dry_run": request.dry_run, "as_json": request.as_json}
-        code, job = carry_out(client, spec, f"evaluate {request.source}", _printed, **modes)
-        if job and code == 0 and (request.as_json or then):
+        elsewhere = queue_change(client, changes, queue, engine)
+        spec = _spec(client, named(run), kind, name, section, [*worlds, *elsewhere])
+        modes = {"follows": follow, "dry_run": dry_run, "as_json": as_json}
+        code, job = carry_out(client, spec, f"evaluate {source}", _printed, **modes)
+        if job and code == 0 and (as_json or then):
             found = client.get(f"/api/runs/{named(run)}/evaluations")
             result = next(each for each in found if each.get("job") == job)
             if then:
                 then(Path(client.get(f"/api/runs/{named(run)}")["path"]), result["name"])
-            if request.as_json:
+            if as_json:
                 echo_json(result, indent=1)
     return code
 
 
 def _spec(
-    client: Client, run: str, request: EvaluationRequest, section: Mapping[str, Any], elsewhere: Sequence[str]
+    client: Client, run: str, kind: str, name: str | None, section: Mapping[str, Any], changes: Sequence[str]
 ) -> Spec:
     """The job, on nodes like the training's. Raises SpecError, and ApiError for an unknown run."""
-    kind, trained = request.kind, client.get(f"/api/runs/{run}")["spec"] or {}
+    trained = client.get(f"/api/runs/{run}")["spec"] or {}
     source = f"{'evaluation' if kind == 'evaluate' else kind} of {run}"
-    worlds = [f"{kind}.{each}" if each.startswith(("config.", "config=")) else each for each in request.changes]
-    document = override(evaluation_document(run, trained, section, request.name, kind), [*worlds, *elsewhere])
     train = trained.get("train") or {}
     whole = with_files(
-        document,
+        override(evaluation_document(run, trained, section, name, kind), changes),
         source,
         task=train.get("task"),
         base=train.get("config") or {},

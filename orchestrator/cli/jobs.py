@@ -126,7 +126,7 @@ def _titled(detail: Mapping[str, Any]) -> str:
 
 
 def _can_continue(detail: Mapping[str, Any]) -> bool:
-    """Whether a job's run can be resumed: it comes from YAML, is no array, and has a checkpoint or runs a command."""
+    """Whether a job's run can be resumed: it comes from YAML, is not an array, and has a checkpoint or runs a command."""
     if not detail["spec"] or detail["children"]:
         return False
     return bool((detail["results"] or {}).get("checkpoint") or (detail["kind"] == "command" and detail["run"]))

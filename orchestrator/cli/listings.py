@@ -36,7 +36,7 @@ class Resource:
         folded: Headings of columns whose cells may take several lines on a terminal.
         title: A line above the table.
         blank: Shown in an empty cell.
-        problem: Key of a row that can't be read for why, and words before that.
+        problem: Key of a row that can't be read for why, and words before that, if any.
         whole: Print each row on a line of its own, whatever the terminal's width.
     """
 
@@ -64,6 +64,10 @@ class Resource:
             table.add_row(*(_text(row[i] or self.blank) for i in shown))
         return table
 
+    def texts(self, row: Row) -> list[str]:
+        """The cells of a row as text."""
+        return [str(cell) or self.blank for cell in self._cells(row)]
+
     def _cells(self, row: Row) -> list[Text | str]:
         try:
             values = [row.get(cell) if isinstance(cell, str) else cell(row) for cell in self.columns.values()]
@@ -73,11 +77,11 @@ class Resource:
                 raise
             first = next(iter(self.columns.values()))
             name = row[first] if isinstance(first, str) else first(row)
-            values = [name, *[None] * (len(self.columns) - 2), f"{words}: {row[key]}"]
+            values = [name, *[None] * (len(self.columns) - 2), f"{words}: {row[key]}" if words else row[key]]
         return [value if isinstance(value, Text) else "" if value is None else str(value) for value in values]
 
     def show(self, rows: Sequence[Row], as_json: bool = False) -> None:
-        """Print the rows as JSON, as a table, or that there are none."""
+        """Print the rows as JSON, as a table, or :attr:`empty`."""
         if as_json:
             echo_json(rows, indent=1)
         elif rows:

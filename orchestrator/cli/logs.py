@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.command_options import JobArgument, JsonOption, SinceOption, seconds_since
-from orchestrator.cli.progress import Waits
+from orchestrator.cli.progress import log_lines
 from orchestrator.cli.terminal import echo, echo_raw, to_json, visible
 from orchestrator.client import Client, named
 from orchestrator.domain import reasons
@@ -52,16 +52,11 @@ def logs(
         raise SpecError(f"--grep {grep}: not a regular expression ({error})") from None
     colour, is_empty = sys.stdout.isatty(), True
     with Client.connect() as client:
-        client.notify = lambda line: echo(line, err=True)
-        waits = Waits(client, job)
-        waits.show()
+        batches = log_lines(client, job, follow=follow, node=node, rank=rank, attempt=attempt)
         hint = _children_hint(client, job) if follow else ""
         if hint:
             echo(hint, err=True)
-        for lines in client.log_batches(job, follow=follow, node=node, rank=rank, attempt=attempt):
-            if not lines:
-                waits.show()
-                continue
+        for lines in batches:
             is_empty = False
             shown = [
                 to_json(line) if as_json else _format(line, colour, raw)

@@ -28,7 +28,7 @@ class CommandGroup(TyperGroup):
     """A group of commands that refuses an unknown one with the nearest name."""
 
     otherwise = ""
-    """The command for an argument that is no command's name, as in `muster queues default`."""
+    """The command for an argument that isn't a command's name, as in `muster queues default`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         if self.invoke_without_command and args[:1] == ["--json"] and not "".join(args[1:2]).startswith("-"):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -33,7 +34,9 @@ def follow(client: Client, job_id: str) -> int:
     """
     detail = client.get(f"/api/jobs/{job_id}")
     if detail["kind"] != "train":
-        return _follow_logs(client, job_id)
+        for lines in log_lines(client, job_id, follow=True):
+            echo_raw("\n".join(map(_format, lines)))
+        return summary(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
     client.notify = display.note
     seen = 0
@@ -116,33 +119,31 @@ def describe_best(run: str, best: Mapping[str, Any] | None) -> str:
     return f"{run}@{best['iteration']}, mean return {best['mean']:.2f}, best of {best['of']} evaluated checkpoints"
 
 
-def _follow_logs(client: Client, job_id: str) -> int:
-    client.notify = lambda line: echo(line, err=True)
-    waits = Waits(client, job_id)
-    waits.show()
-    for lines in client.log_batches(job_id, follow=True):
-        if lines:
-            echo_raw("\n".join(map(_format, lines)))
-        else:
-            waits.show()
-    return summary(client, job_id)
+def log_lines(client: Client, job: str, **query: Any) -> Iterator[list[dict[str, Any]]]:
+    """The lines of a job's log, many at a time; standard error has why it waits, and what else its follower waits for.
 
+    Raises ApiError, Unreachable.
+    """
+    shown = ""
 
-class Waits:
-    """Lines on standard error about a job that has nothing to show because it waits."""
-
-    def __init__(self, client: Client, job: str) -> None:
-        self._client, self._job, self._printed = client, job, ""
-
-    def show(self) -> None:
+    def explain() -> None:
         """Print why the job waits, if that is new."""
-        try:
-            text = _why_waiting(self._client, self._job)
-        except (ApiError, Unreachable):  # the reader of the log meets it, too
-            return
-        if text and text != self._printed:
-            echo(text, err=True)
-        self._printed = text
+        nonlocal shown
+        with suppress(ApiError, Unreachable):  # the reader of the log meets it, too
+            if (text := _why_waiting(client, job)) and text != shown:
+                echo(text, err=True)
+            shown = text
+
+    def batches() -> Iterator[list[dict[str, Any]]]:
+        for lines in client.log_batches(job, **query):
+            if lines:
+                yield lines
+            else:
+                explain()
+
+    client.notify = lambda line: echo(line, err=True)
+    explain()
+    return batches()
 
 
 def _why_waiting(client: Client, job: str) -> str:

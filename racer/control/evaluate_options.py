@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from orchestrator.cli.catalogue import FurtherOptions
-from orchestrator.cli.evaluations import EvaluationRequest, follow_evaluation
+from orchestrator.cli.evaluations import follow_evaluation
 from orchestrator.cli.terminal import echo
 from orchestrator.domain.errors import ServerError, UsageError
 from racer.store.races import BESIDE, SIM_TRACE
@@ -80,17 +80,14 @@ def race_or_evaluate(
         "crash_penalty": penalty,
         "accept_changed_robot": supplied["accept_changed_robot"] or None,
     }
-    place = {
-        key: supplied[key]
-        for key in ("source", "name", "engine", "store", "cpus", "as_json", "queue", "follow", "dry_run")
-    }
-    request = EvaluationRequest(section=section, changes=supplied["set_"] or (), kind="race", **place)
+    modes = {key: supplied[key] for key in ("queue", "engine", "store", "cpus", "follow", "dry_run", "as_json")}
 
     def copy(run: Path, evaluation: str) -> None:
         if output is not None:
-            _copy(run, evaluation, output, request.as_json)
+            _copy(run, evaluation, output, supplied["as_json"])
 
-    raise typer.Exit(follow_evaluation(request, copy))
+    what = supplied["source"], section, supplied["set_"], supplied["name"]
+    raise typer.Exit(follow_evaluation(*what, kind="race", then=copy, **modes))
 
 
 OPTIONS = FurtherOptions(

@@ -19,10 +19,10 @@ from orchestrator.cli.command_options import (
     split_model,
 )
 from orchestrator.cli.controllers import controller, see_through
-from orchestrator.cli.listings import Resource
+from orchestrator.cli.listings import Resource, show_facts
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
-from orchestrator.cli.progress import summary
+from orchestrator.cli.progress import await_end
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, NotServing, UsageError
@@ -40,34 +40,6 @@ OptionalEntry = Annotated[
 
 _EXAMPLES = """Examples:  muster league create cup --track oval --laps 3   then   muster league submit cup fast@1 --as ada
 muster league table cup -o cup.png   and   muster league verify cup 1 --rerun"""
-
-
-def _state(league: Mapping[str, Any]) -> str:
-    if league["closed"]:
-        return str(league["closed"]).removeprefix(f"league {league['name']} ")
-    return f"open until {moment(league['closes'])}" if league["closes"] else "open"
-
-
-_LEAGUES = Resource(
-    {
-        "LEAGUE": "name",
-        "TRACK": lambda league: ", ".join(league["track"]),
-        "LAPS": lambda league: league["rules"]["laps"],
-        "RANKING": lambda league: league["rules"]["ranking"],
-        **{"ENTRIES": "entries", "OWNER": "owner", "STATE": _state},
-    },
-    "no league was created yet; muster league create NAME --track oval",
-    "/api/leagues",
-)
-_LAPS = Resource(
-    {
-        "LAP": "trial",
-        "TIME": lambda lap: clock(lap.get("time")),
-        "PENALTY": lambda lap: f"{lap.get('penalty') or 0:g} s",
-        "COMPLETE": lambda lap: f"{lap.get('completion') or 0:.1f} %",
-        **{"OFF-TRACKS": "off_tracks", "CRASHES": "crashes", "RESETS": "resets", "STATUS": "status"},
-    }
-)
 
 
 def register(app: typer.Typer) -> None:
@@ -167,6 +139,40 @@ def _moment(option: str, text: str | None) -> float | None:
         raise UsageError(f"{option} {text}: expected a time such as 2026-12-24T18:00, or 2026-12-24T18:00Z") from None
 
 
+def _state(league: Mapping[str, Any]) -> str:
+    if league["closed"]:
+        return str(league["closed"]).removeprefix(f"league {league['name']} ")
+    return f"open until {moment(league['closes'])}" if league["closes"] else "open"
+
+
+_LEAGUES = Resource(
+    {
+        "LEAGUE": "name",
+        "TRACK": lambda league: ", ".join(league["track"]),
+        "LAPS": lambda league: league["rules"]["laps"],
+        "RANKING": lambda league: league["rules"]["ranking"],
+        "ENTRIES": "entries",
+        "OWNER": "owner",
+        "STATE": _state,
+    },
+    "no league was created yet; muster league create NAME --track oval",
+    "/api/leagues",
+    problem=("problem", ""),
+)
+_LAPS = Resource(
+    {
+        "LAP": "trial",
+        "TIME": lambda lap: clock(lap.get("time")),
+        "PENALTY": lambda lap: f"{lap.get('penalty') or 0:g} s",
+        "COMPLETE": lambda lap: f"{lap.get('completion') or 0:.1f} %",
+        "OFF-TRACKS": "off_tracks",
+        "CRASHES": "crashes",
+        "RESETS": "resets",
+        "STATUS": "status",
+    }
+)
+
+
 def show(
     league: LeagueArgument, entry: OptionalEntry = None, store: StoreOption = None, as_json: JsonOption = False
 ) -> None:
@@ -188,17 +194,20 @@ def _print_league(league: Mapping[str, Any]) -> None:
     rules = league["rules"]
     counts = {"total": "the time of all laps", "best": "the best lap", "average": "the mean of the complete laps"}
     echo(f"{league['name']}: {counted(rules['laps'], 'lap')} on {', '.join(league['track'])}; {_state(league)}")
-    echo(f"  ranked by:  {counts[rules['ranking']]}")
+    continuous = "no, a car that leaves the road has ended its lap"
     if rules["continuous"]:
         penalties = f"{rules['off_track_penalty']:g} s off the track, {rules['crash_penalty']:g} s for a crash"
-        echo(f"  continuous: put back at most {counted(rules['max_resets'], 'time')} in a lap; {penalties}")
-    else:
-        echo("  continuous: no, a car that leaves the road has ended its lap")
-    echo(f"  lap:        at most {rules['seconds']:g} s, seed {league['seed']}")
+        continuous = f"put back at most {counted(rules['max_resets'], 'time')} in a lap; {penalties}"
     most = counted(league["most_entries"], "entry", "entries")
-    echo(f"  entries:    {league['entries']}; at most {most} of each key or user")
-    echo(f"  created:    {moment(league['created'])} by {league['owner']}")
-    echo(f"  digest:     {league['digest']}")
+    facts = {
+        "ranked by": counts[rules["ranking"]],
+        "continuous": continuous,
+        "lap": f"at most {rules['seconds']:g} s, seed {league['seed']}",
+        "entries": f"{league['entries']}; at most {most} of each key or user",
+        "created": f"{moment(league['created'])} by {league['owner']}",
+        "digest": league["digest"],
+    }
+    show_facts(facts, 11)
 
 
 def _print_entry(entry: Mapping[str, Any]) -> None:
@@ -206,10 +215,13 @@ def _print_entry(entry: Mapping[str, Any]) -> None:
         model, evaluation = entry["model"], entry["evaluation"]
         echo(f"entry {entry['entry']}: {entry['racer']} with {model['name']}@{model['version']} ({model['task']})")
         _LAPS.show(entry["race"]["trials"])
-        echo(f"  entered:     {moment(entry['entered'])} by {entry['owner']}")
-        echo(f"  evaluation:  {evaluation['name']} of run {evaluation['run']}, job {evaluation['job']}")
-        echo(f"  model:       {model['digest']}")
-        echo(f"  digest:      {entry['digest']}")
+        facts = {
+            "entered": f"{moment(entry['entered'])} by {entry['owner']}",
+            "evaluation": f"{evaluation['name']} of run {evaluation['run']}, job {evaluation['job']}",
+            "model": model["digest"],
+            "digest": entry["digest"],
+        }
+        show_facts(facts, 12)
     if ruling := entry.get("ruling"):
         echo(f"  disqualified: {ruling['reason']}")
     if entry.get("problem"):
@@ -252,7 +264,7 @@ def submit(
         client = connect()
         if evaluation is None:
             started = client.post(f"{path}/races", body, seconds=300, once=True)
-            code = see_through(client, started["jobId"], *([_quietly] if as_json else []))
+            code = see_through(client, started["jobId"], *([await_end] if as_json else []))
             if code:
                 raise typer.Exit(code)
             body["version"], evaluation = (
@@ -279,13 +291,6 @@ def _print_started(started: Mapping[str, Any], league: str, racer: str | None, a
     echo(f"enter it after it has ended: muster league submit {league} {reference}{name} --evaluation {job}")
 
 
-def _quietly(client: Client, job: str) -> int:
-    """Wait for a job, and print how it ended if it did not succeed. Returns the exit code."""
-    for _ in client.logs(job, follow=True):
-        pass
-    return 0 if client.get(f"/api/jobs/{job}")["status"] == "SUCCEEDED" else summary(client, job)
-
-
 def show_table(
     league: LeagueArgument,
     every: Annotated[bool, typer.Option("--all", help="Show every entry of a racer, not only the best.")] = False,
@@ -306,11 +311,14 @@ def show_table(
         rows = client.get(f"/api/leagues/{named(league)}/entries", every=every)
     if output is not None:
         write(found, rows, output)
-    if as_json or rows:
-        TABLE.show(rows, as_json)
-    else:
+    if as_json:
+        echo_json(rows, indent=1)
+        return
+    if not rows:
         echo(f"{league} has no entries yet; muster league submit {league} MODEL")
-    if output is not None and not as_json:
+    else:
+        TABLE.show(rows)
+    if output is not None:
         echo(f"written: {output}")
 
 
@@ -371,7 +379,7 @@ def _again(client: Client, path: str, entry: Mapping[str, Any]) -> list[str]:
         raise
     except ApiError as error:  # of this entry only: for example, its checkpoint was deleted
         return [str(error)]
-    if see_through(client, started["jobId"], _quietly):
+    if see_through(client, started["jobId"], await_end):
         return [f"its race was not driven again: job {started['jobId'][:8]} did not succeed"]
     listed = client.get(f"/api/runs/{named(started['run'])}/evaluations")
     again = next(each for each in listed if each.get("job") == started["jobId"])

@@ -1,4 +1,4 @@
-"""The table of a league: as cells, as CSV, and as a picture drawn without a display."""
+"""The table of a league: its columns, as CSV, and as a picture drawn without a display."""
 
 from __future__ import annotations
 
@@ -15,10 +15,6 @@ from racer.store.standings import Row
 from shared_store.volume.files import write_atomic
 
 
-def _laps(row: Mapping[str, Any]) -> str:
-    return "" if row["laps"] is None else f"{row['completed']} of {row['laps']}"
-
-
 def _status(row: Mapping[str, Any]) -> str:
     words = {"ranked": "ranked", "altered": row["reason"]}
     return words.get(row["status"]) or f"{row['status']}: {row['reason']}"
@@ -26,11 +22,17 @@ def _status(row: Mapping[str, Any]) -> str:
 
 TABLE = Resource(
     {
-        **{"RANK": "rank", "ENTRY": "entry", "RACER": "racer", "MODEL": "model"},
+        "RANK": lambda row: row["rank"] or None,
+        "ENTRY": "entry",
+        "RACER": "racer",
+        "MODEL": "model",
         "TIME": lambda row: clock(row["time"]),
         "BEST LAP": lambda row: clock(row["best_lap"]),
-        "LAPS": _laps,
-        **{"OFF-TRACKS": "off_tracks", "CRASHES": "crashes", "RESETS": "resets", "STATUS": _status},
+        "LAPS": lambda row: None if row["laps"] is None else f"{row['completed']} of {row['laps']}",
+        "OFF-TRACKS": "off_tracks",
+        "CRASHES": "crashes",
+        "RESETS": "resets",
+        "STATUS": _status,
     }
 )
 
@@ -59,8 +61,7 @@ def _picture(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> by
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    columns = [[str(cell) for cell in column.cells] for column in TABLE.table(rows).columns]
-    shown = [list(row) for row in zip(*columns[:-1], [row["status"] for row in rows], strict=True)]
+    shown = [[*TABLE.texts(row)[:-1], row["status"]] for row in rows]
     figure = Figure(figsize=(11, 1.2 + 0.3 * len(shown)), dpi=120)
     FigureCanvasAgg(figure)
     axes = figure.subplots()
@@ -68,13 +69,13 @@ def _picture(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> by
     rules = league["rules"]
     title = f"{league['name']}: {rules['laps']} x {', '.join(league['track'])}, ranked by {rules['ranking']}"
     axes.set_title(title.replace("$", r"\$"), loc="left")
-    texts = [[each.replace("$", r"\$") for each in row] for row in (shown or [["-"] * len(columns)])]
+    texts = [[each.replace("$", r"\$") for each in row] for row in (shown or [["-"] * len(TABLE.columns)])]
     table = axes.table(
         cellText=texts, colLabels=list(TABLE.columns), cellLoc="left", loc="upper left", edges="horizontal"
     )
     table.auto_set_font_size(False)
     table.set_fontsize(9)
-    table.auto_set_column_width(range(len(columns)))
+    table.auto_set_column_width(range(len(TABLE.columns)))
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", bbox_inches="tight")
     return buffer.getvalue()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -11,7 +10,7 @@ import typer
 
 from orchestrator.cli.command_options import JsonOption, OverwriteOption, StoreOption
 from orchestrator.cli.controllers import controller
-from orchestrator.cli.listings import Resource
+from orchestrator.cli.listings import Resource, date, show_facts
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
 from orchestrator.cli.terminal import echo, echo_json
@@ -29,29 +28,6 @@ NewName = Annotated[str, typer.Option("--name", help="Name of the track.")]
 
 _EXAMPLES = """Examples:  muster tracks show random:7 -o track.png
 muster tracks make hills --seed 7 --length 45   then   muster tracks list"""
-
-
-def _width(track: Mapping[str, Any]) -> str:
-    least, most = track["width"]
-    return f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m"
-
-
-def _origin(origin: Mapping[str, Any]) -> str:
-    """The origin of a track, then its settings."""
-    keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
-    return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)
-
-
-_TRACKS = Resource(
-    {
-        "TRACK": "name",
-        "LENGTH": lambda track: f"{track['length']:.2f} m",
-        "WIDTH": _width,
-        "RADIUS": lambda track: f"{track['least_radius']:.2f} m",
-        **{"DIRECTION": "direction", "WAYPOINTS": "waypoints"},
-        "FROM": lambda track: _origin(track["origin"]),
-    }
-)
 
 
 def register(app: typer.Typer) -> None:
@@ -159,17 +135,38 @@ def _print(track: Mapping[str, Any], output: Path | None, as_json: bool) -> None
         echo_json(track, indent=1)
         return
     echo(f"{track['name']}: {track['length']:.2f} m long, {_width(track)} wide, {track['direction']}")
-    echo(f"  tightest:   a radius of {track['least_radius']:.2f} m")
-    steps = track["waypoints"] - (not track["closed"])
-    echo(f"  waypoints:  {track['waypoints']}, {track['length'] / steps:.3f} m apart")
-    if origin := track.get("origin"):
-        echo(f"  from:       {_origin(origin)}")
-        for note in origin.get("notes") or ():
-            echo(f"  mended:     {note}")
-    if created := track.get("created"):
-        echo(f"  kept:       {time.strftime('%Y-%m-%d %H:%M:%S', time.localtime(created))}")
-    echo(f"  digest:     {track['digest']}")
-    if path := track.get("path"):
-        echo(f"  lies in:    {path}")
+    steps, origin = track["waypoints"] - (not track["closed"]), track.get("origin") or {}
+    apart = f"{track['waypoints']}, {track['length'] / steps:.3f} m apart"
+    show_facts(
+        {"tightest": f"a radius of {track['least_radius']:.2f} m", "waypoints": apart, "from": _origin(origin)}, 11
+    )
+    for note in origin.get("notes") or ():
+        show_facts({"mended": note}, 11)
+    show_facts({"kept": date(track.get("created")), "digest": track["digest"], "lies in": track.get("path")}, 11)
     if output is not None:
         echo(f"written: {output}")
+
+
+def _width(track: Mapping[str, Any]) -> str:
+    least, most = track["width"]
+    return f"{least:.2f} m" if most - least < 0.005 else f"{least:.2f} to {most:.2f} m"
+
+
+def _origin(origin: Mapping[str, Any]) -> str:
+    """The origin of a track, then its settings."""
+    keys = sorted(origin.keys() - {"notes"}, key=lambda key: (key not in ("preset", "seed", "file"), key))
+    return ", ".join(f"{key.replace('_', ' ')} {origin[key]}" for key in keys)
+
+
+_TRACKS = Resource(
+    {
+        "TRACK": "name",
+        "LENGTH": lambda track: f"{track['length']:.2f} m",
+        "WIDTH": _width,
+        "RADIUS": lambda track: f"{track['least_radius']:.2f} m",
+        "DIRECTION": "direction",
+        "WAYPOINTS": "waypoints",
+        "FROM": lambda track: _origin(track["origin"]),
+    },
+    problem=("problem", ""),
+)

@@ -32,7 +32,9 @@ def places(console: Console) -> dict[str, str]:
     with MetricsWriter(store.run("taught"), 1, 0) as metrics:
         for iteration in range(1, 10):
             metrics.write({"iteration": iteration, "reward": iteration / 2, "reward_alive": 1.0, "policy_loss": 0.1})
-    output = submit_gang(console.client, f"print({HOSTILE!r}); raise ValueError({HOSTILE!r})", name="said", cpus="0.5")
+    output = submit_gang(
+        console.client, f"print({HOSTILE!r}); raise ValueError({HOSTILE!r})", name="hostile", cpus="0.5"
+    )
     await_status(console.client, output, "FAILED")
     training = console.client.post("/api/runs/taught/resume", {"set": ["train.iterations=20"]})["jobId"]
     lists = {each: f"/{each}" for each in ("submit", "runs", "queues", "keys", "models")}

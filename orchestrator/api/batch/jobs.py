@@ -149,7 +149,7 @@ def terminate_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
 
 
 def cancel_job(context: Context, request: dict[str, Any]) -> dict[str, Any]:
-    """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, and that is no error, as on AWS."""
+    """CancelJob: FAILED for a job that has not begun to start; for a later one nothing, without an error, as on AWS."""
     _end(context, request["jobId"], request["reason"], Operation.CANCEL_JOB)
     return {}
 

@@ -65,7 +65,7 @@ class RequestHead:
         origin = self.single("origin")
         if origin and _split(origin).netloc.lower() != host.lower():
             raise Refusal("AccessDeniedException", f"requests from other web pages are refused (Origin {origin!r})")
-        # a browser sends no Origin with what it only reads, such as an image; a link that a person follows is no such request
+        # a browser sends no Origin with what it only reads, such as an image; a link that a person follows is another request
         site, target = (
             self.single("sec-fetch-site"),
             (self.headers.get("sec-fetch-mode"), self.headers.get("sec-fetch-dest")),

@@ -29,7 +29,7 @@ from orchestrator.services.permissions import Actor, JobsOf
 router = APIRouter()
 
 FIRST = 10
-"""Waiting jobs of each queue that are told, where none is named."""
+"""Waiting jobs of each queue that are reported, where none is named."""
 MOST = 100
 """Of one that is named."""
 

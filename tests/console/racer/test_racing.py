@@ -1,4 +1,4 @@
-"""A racer with a reward function of one's own, from the wizard's editor to the table of a league, by clicking."""
+"""A racer with a custom reward function, from the wizard's editor to the table of a league, by clicking."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A track made by clicking, after a mistake that is told at its field."""
+"""A track made by clicking, after a mistake that is shown at its field."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from tests.support.console.fixtures import Console
 from tests.support.console.person import People
 
 
-def test_a_track_is_made_after_a_mistake_was_told_at_its_field(console: Console, people: People) -> None:
+def test_a_track_is_made_after_a_mistake_was_shown_at_its_field(console: Console, people: People) -> None:
     person = people(console.url, console.secrets["admin"])
     page = person.goto("/tracks")
     page.get_by_text("Make a track").click()

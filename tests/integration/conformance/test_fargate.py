@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any
 
 import pytest
@@ -221,20 +220,14 @@ def test_members_of_eks_are_refused_by_name_in_compute_resources(
 
 
 def test_eks_is_refused_by_its_name_wherever_it_is_asked_for(batch: Batch) -> None:
-    request = json.loads(
-        '{"jobDefinitionName": "eks", "type": "container", "eksProperties": {"podProperties": {"containers": '
-        '[{"image": "any", "command": ["sleep", "60"]}]}}}'
-    )
     why = "eksProperties is not supported: no engine is a Kubernetes cluster; use"
     with refused(f"job definition eks: {why} containerProperties or ecsProperties"):
-        batch.api.register_job_definition(**request)
+        batch.register("eks", "container", eksProperties=EKS)
     with refused(f"job definition eks: {why} nodeProperties"):
         batch.register("eks", "multinode", eksProperties=EKS)
     ranges = [{"targetNodes": "0:", "eksProperties": EKS}]
     with refused(f"node range 0:: {why} container or ecsProperties"):
         batch.register("eks", "multinode", nodeProperties={"numNodes": 1, "mainNode": 0, "nodeRangeProperties": ranges})
-    with refused("eksPropertiesOverride is not supported: no engine is a Kubernetes cluster; use containerOverrides"):
-        batch.submit(batch.single("not-eks", "true"), eksPropertiesOverride=EKS)
     with refused("eksConfiguration is not supported: no engine is a Kubernetes cluster"):
         batch.api.create_compute_environment(
             computeEnvironmentName="eks",

@@ -73,7 +73,7 @@ def test_another_service_is_refused_its_way(
         assert "this is Muster" in error["Message"] and "AWS_ENDPOINT_URL_BATCH" in error["Message"]
 
 
-def test_requests_that_are_not_signed_or_signed_in_the_address_are_told_too(server: Serving) -> None:
+def test_requests_that_are_not_signed_or_signed_in_the_address_are_refused_too(server: Serving) -> None:
     unsigned_as = Config(signature_version=UNSIGNED)
     unsigned = boto3.client("sts", endpoint_url=server.url, region_name="us-east-1", config=unsigned_as)
     with pytest.raises(ClientError, match="this is Muster"):
@@ -158,7 +158,7 @@ def test_a_job_may_keep_its_directory(batch: Batch) -> None:
     shutil.rmtree(Path(directory).parent)
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become somebody else")
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
 def test_a_job_runs_as_the_user_that_it_names(batch: Batch) -> None:
     script = "id -u; id -g; touch here; [ -w $HOME ] && exec sleep 600"
     job = batch.submit(batch.single("iso-user", script, container={"user": "nobody"}))

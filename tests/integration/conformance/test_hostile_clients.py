@@ -21,7 +21,7 @@ from tests.support.definitions import container, single
 COUNT = int(os.environ.get("MUSTER_FUZZ", "0")) // 10 or 60
 DESCRIPTORS = 256
 MOST_LOG = 100_000
-"""Bytes that the server may have said about all of it."""
+"""Bytes that the server may log about all of it."""
 
 
 class FewDescriptors(Fuzzed):

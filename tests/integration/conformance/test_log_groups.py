@@ -1,4 +1,4 @@
-"""Log groups of users: jobs that log there, and what scripts, aegea, covalent and Terraform call before and after a job."""
+"""Log groups of users: jobs that log there, and what scripts, covalent and Terraform call before and after a job."""
 
 from __future__ import annotations
 
@@ -160,36 +160,30 @@ def test_a_name_that_no_group_can_have_is_refused_where_it_is_given(batch: Batch
         logs.create_log_group(logGroupName=name)
 
 
-def test_a_prefix_that_no_stream_can_have_is_refused(batch: Batch) -> None:
-    with refused("awslogs-stream-prefix 'a:b'"):
-        batch.single("misnamed", "true", container={"logConfiguration": logging_to(None, "a:b")})
-
-
 @pytest.mark.parametrize(
-    ("option", "value", "values"),
-    [("mode", "weird", "blocking or non-blocking"), ("awslogs-create-group", "maybe", "true or false")],
+    ("option", "value", "words"),
+    [
+        ("awslogs-stream-prefix", "a:b", "awslogs-stream-prefix 'a:b'"),
+        ("mode", "weird", "logConfiguration mode is 'weird'; it is blocking or non-blocking"),
+        ("awslogs-create-group", "maybe", "logConfiguration awslogs-create-group is 'maybe'; it is true or false"),
+    ],
 )
-def test_a_value_that_an_option_can_t_have_is_refused(batch: Batch, option: str, value: str, values: str) -> None:
-    with refused(f"logConfiguration {option} is '{value}'; it is {values}"):
+def test_a_value_that_an_option_can_t_have_is_refused(batch: Batch, option: str, value: str, words: str) -> None:
+    with refused(words):
         batch.single("misset", "true", container={"logConfiguration": logging_to(None, **{option: value})})
 
 
 @pytest.mark.parametrize("value", ["true", "True", "0", ""])
-def test_a_truth_value_is_taken_as_docker_s_driver_takes_it(batch: Batch, value: str) -> None:
-    options = {"awslogs-create-group": value, "mode": ""}
-    batch.single("options", "true", container={"logConfiguration": logging_to(None, **options)})
-
-
-def test_every_option_of_the_driver_is_taken(batch: Batch, own: str) -> None:
-    options = {"awslogs-region": "us-west-2", "awslogs-create-group": "false", "mode": "blocking"}
+def test_every_option_of_the_driver_is_taken_and_a_truth_value_as_docker_s_takes_it(batch: Batch, value: str) -> None:
+    options = {"awslogs-region": "us-west-2", "awslogs-create-group": value, "mode": "blocking" if value else ""}
     options |= {"awslogs-datetime-format": "%Y", "awslogs-multiline-pattern": "^a", "max-buffer-size": "4m"}
-    batch.single("options", "true", container={"logConfiguration": logging_to(own, "p", **options)})
+    batch.single("options", "true", container={"logConfiguration": logging_to("/options", "p", **options)})
 
 
 # -- the groups -------------------------------------------------------------------------------------------------------
 
 
-def test_what_is_there_already_is_said_as_aws_says_it(logs: Any, own: str) -> None:
+def test_what_exists_already_is_refused_as_on_aws(logs: Any, own: str) -> None:
     for name in (GROUP, own):
         if name == own:
             logs.create_log_group(logGroupName=own)
@@ -322,22 +316,6 @@ def test_as_terraform_manages_a_log_group(logs: Any, own: str) -> None:
     assert groups_of(logs, own) == []
     with pytest.raises(logs.exceptions.ResourceNotFoundException):
         logs.list_tags_for_resource(resourceArn=arn)
-
-
-def test_as_aegea_makes_sure_of_its_log_group(logs: Any, own: str) -> None:
-    """Its ``ensure_log_group``: look for the name among the pages, else create it, swallow that it exists, and look again."""
-
-    def resolve(name: str) -> Any:
-        pages = logs.get_paginator("describe_log_groups").paginate(logGroupNamePrefix=name)
-        return next((each for page in pages for each in page["logGroups"] if each["logGroupName"] == name), None)
-
-    for name in (GROUP, own):
-        if (group := resolve(name)) is None:
-            logs.create_log_group(logGroupName=name)
-            group = resolve(name)
-        assert group["logGroupName"] == name
-        with pytest.raises(logs.exceptions.ResourceAlreadyExistsException):
-            logs.create_log_group(logGroupName=name)
 
 
 def test_as_covalent_runs_a_task(batch: Batch, logs: Any) -> None:

@@ -59,7 +59,7 @@ def children(batch: Batch, job: str, **query: Any) -> dict[int, dict[str, Any]]:
 
 
 def test_every_node_has_the_variables_of_aws_and_no_other(batch: Batch, tmp_path: Path) -> None:
-    """Three nodes by an override of two; node 1 is the main node, and leaves when the others have said their part."""
+    """Three nodes by an override of two; node 1 is the main node, and leaves when the others are done."""
     script = f"""
 env | grep -E '^AWS_(BATCH|EXECUTION)' | sort
 read -r _ _ _ shim _ < /proc/$PPID/stat
@@ -93,7 +93,7 @@ touch "$GATE/{NODE}"
     # the main node is started first, whatever its index: ticks since boot, then process ids where they are equal
     starts = [tuple(map(int, line.split()[1:])) for lines in output for line in lines if line.startswith("started")]
     assert len(starts) == 3 and min(starts) == starts[1]
-    # what is said of the parent is the main node's, which is not node 0 here
+    # the parent shows the main node's end, which is not node 0 here
     assert (parent["status"], parent["statusReason"]) == ("FAILED", EXITED)
     assert attempt["container"]["exitCode"] == 3 and attempt["statusReason"] == EXITED
     assert attempt["startedAt"] == parent["startedAt"] <= attempt["stoppedAt"] <= parent["stoppedAt"]

@@ -45,7 +45,7 @@ OWN_LIST = "+ + + o h h o"
 ALL_READ = "+ + - - + - -"
 """It tells of all queues at once."""
 DEFINITION_READ = "+ + + h h h h"
-"""Names and commands of definitions are everybody's to see, values only of one's own."""
+"""Names and commands of definitions are everybody's to see, values only to their owner."""
 
 OF = Operation
 TABLE = {
@@ -315,7 +315,7 @@ def test_a_definition_of_another_key_is_used_only_where_its_tag_names_the_queue(
     assert admin.batch("DescribeJobDefinitions", jobDefinitionName="common")["jobDefinitions"][0]["revision"] == 1
 
 
-def test_names_of_others_are_not_told_by_errors_and_not_found_by_name(world: World) -> None:
+def test_names_of_others_are_not_leaked_by_errors_and_not_found_by_name(world: World) -> None:
     lab = world.clients["lab"]
     with pytest.raises(ApiError, match="does not exist") as caught:
         lab.get(f"/api/runs/{world.run}x")

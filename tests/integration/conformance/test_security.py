@@ -73,14 +73,6 @@ def definition(name: str, size: int = 0) -> dict[str, Any]:
     return multinode(name, container(env={"FILLING": "x" * size}))
 
 
-def test_boto3_with_a_right_key_works(served: Serving, key: Key) -> None:
-    batch = client(served.url, key.access_key_id, key.secret)
-    batch.register_job_definition(**definition("right"))
-    job = batch.submit_job(jobName="right", jobQueue="default", jobDefinition="right")["jobId"]
-    assert batch.describe_jobs(jobs=[job])["jobs"][0]["jobName"] == "right"
-    batch.terminate_job(jobId=job, reason="seen enough")
-
-
 def test_a_wrong_secret_and_an_unknown_key_get_different_errors(served: Serving, key: Key) -> None:
     with pytest.raises(ClientError, match="does not match the signature") as wrong:
         client(served.url, key.access_key_id, key.secret[::-1]).list_jobs(jobQueue="default")
@@ -209,24 +201,6 @@ def test_a_read_only_key_may_only_read(served: Serving, home: Path) -> None:
     assert httpx.get(f"{served.url}/api/runs", headers=bearer).status_code == 200
     for path in ("/api/runs/x/resume", "/v1/SubmitJob", "/v1/describe/../submitjob", "/v1/getx%2Fy", "//v1/listjobs"):
         refused(httpx.post(served.url + path, headers=bearer, json={}), "AccessDeniedException")
-
-
-def test_keys_come_and_go_without_a_restart(served: Serving, home: Path) -> None:
-    done = call_muster("keys", "create", "passing", "--queue", "robots", "--queue", "default", home=home)
-    assert done.returncode == 0, done.stderr
-    passing = next(each for each in HomeKeys(home).load().values() if each.name == "passing")
-    assert passing.queues == ("robots", "default")
-    assert f"export MUSTER_TOKEN={passing.access_key_id}:{passing.secret}" in done.stdout
-    batch = client(served.url, passing.access_key_id, passing.secret)
-    batch.list_jobs(jobQueue="default")
-    assert call_muster("keys", "delete", "passing", home=home).returncode == 0
-    bearer = {"Authorization": f"Bearer {passing.access_key_id}:{passing.secret}"}
-    wait_for(
-        lambda: httpx.get(f"{served.url}/api/runs", headers=bearer).status_code == 403, what="the look at the keys"
-    )
-    with pytest.raises(ClientError) as caught:
-        batch.list_jobs(jobQueue="default")
-    assert code(caught)[0] == "UnrecognizedClientException"
 
 
 def test_a_key_for_one_queue_changes_no_tag_of_what_others_depend_on(served: Serving, home: Path) -> None:

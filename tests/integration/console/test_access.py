@@ -31,7 +31,7 @@ def test_a_program_without_a_key_still_gets_an_error_that_it_can_read(console: C
     assert (answer.status_code, answer.headers["x-amzn-errortype"]) == (403, "MissingAuthenticationToken")
 
 
-def test_a_wrong_key_is_told_and_opens_nothing(console: Console) -> None:
+def test_a_wrong_key_is_refused_and_opens_nothing(console: Console) -> None:
     name = console.secrets["admin"].partition(":")[0]
     for supplied in ("", "x", name, f"{name}:x", "MSTRAAAAAAAAAAAAAAAA:x", "ä\N{SNOWMAN}"):
         answer = httpx.post(f"{console.url}/login", data={"key": supplied}, trust_env=False)
@@ -219,7 +219,7 @@ def test_a_key_is_made_its_secret_is_shown_once_and_it_works(console: Console) -
     assert again.status_code == 400 and "there is a key alice already" in Page(again.text).text
 
 
-def test_a_key_is_deleted_once_the_person_has_said_yes(console: Console) -> None:
+def test_a_key_is_deleted_once_the_person_has_confirmed(console: Console) -> None:
     key = console.keys.create("bob")
     bob, visitor = Visitor(console.url, secret_of(key)), console.visitor()
     stream = visitor.events("/keys/stream")

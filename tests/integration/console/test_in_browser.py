@@ -81,16 +81,3 @@ def test_curves_are_drawn_and_a_window_of_them_is_read_again(shared_server: Serv
     see(page, "document.querySelector('.chart').dataset.points === '300'")
     for each in (job, blocker):
         shared_server.client.batch("TerminateJob", jobId=each, reason="seen")
-
-
-def test_the_page_of_a_run_renews_how_it_learns(shared_server: Serving, people: People) -> None:
-    store = Store(shared_server.home / "store")
-    add_run(store, "learns", {**SPEC, "name": "learns"})
-    with MetricsWriter(store.run("learns"), 1, 0) as metrics:
-        metrics.write({"iteration": 1, "reward": 1.0, "action_std": 0.5})
-        page = people(shared_server.url).goto("/runs/learns")
-        expect(page.get_by_text("deviation of actions 0.5", exact=True)).to_be_visible()
-        expect(page.get_by_text("Warning", exact=True)).to_have_count(0)
-        metrics.write({"iteration": 2, "reward": 1.0, "action_std": 0.25, "warnings": ["it unlearns: (RUN@best)"]})
-        expect(page.get_by_text("deviation of actions 0.25", exact=True)).to_be_visible()
-        expect(page.get_by_text("it unlearns: (learns@best)", exact=True)).to_be_visible()

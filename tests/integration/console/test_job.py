@@ -52,7 +52,7 @@ def training(console: Console, store: Store) -> str:
 
 @pytest.fixture(scope="module")
 def talking(console: Console, store: Store) -> str:
-    """Id of a job on two nodes that has said much and failed."""
+    """Id of a job on two nodes that has printed much and failed."""
     script = (
         "import os, sys, time\n"
         "node = int(os.environ['AWS_BATCH_JOB_NODE_INDEX'])\n"
@@ -212,7 +212,7 @@ def test_a_checkpoint_is_evaluated_exported_and_recorded_by_jobs_of_their_own(co
     assert visitor.submit(f"/jobs/{training}/evaluate", checkpoint="x").status_code == 400
 
 
-def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_said_yes(console: Console, store: Store) -> None:
+def test_a_run_goes_on_from_an_older_checkpoint_once_the_person_confirmed(console: Console, store: Store) -> None:
     add_run(store, "again", {**SPEC, "name": "again"})
     for iteration in (3, 6):
         add_checkpoint(store, "again", iteration)
@@ -250,7 +250,7 @@ def test_only_an_exported_checkpoint_becomes_a_model(console: Console, training:
     assert console.client.get("/api/models") == []
 
 
-def test_a_job_is_stopped_once_the_person_has_said_yes(console: Console, visitor: Visitor, store: Store) -> None:
+def test_a_job_is_stopped_once_the_person_has_confirmed(console: Console, visitor: Visitor, store: Store) -> None:
     job = submit_gang(console.client, FOREVER, name="runs", queue="first")
     await_status(console.client, job, "RUNNING")
     assert visitor.submit(f"/jobs/{job}/stop").json()["question"]["title"] == f"Stop runs ({job[:8]})?"

@@ -125,7 +125,7 @@ def test_the_stream_has_the_page_first_and_then_only_what_changes(console: Conso
     stream.close()
 
 
-def test_marked_jobs_are_stopped_once_the_person_has_said_yes(console: Console, many: list[str]) -> None:
+def test_marked_jobs_are_stopped_once_the_person_has_confirmed(console: Console, many: list[str]) -> None:
     visitor = console.visitor()
     question = visitor.submit("/jobs/stop", job=many[:2])
     assert question.status_code == 409 and question.json()["question"]["title"] == "Stop 2 jobs?"
@@ -236,7 +236,9 @@ def test_one_stream_renews_all_tables(console: Console, waiting: dict[str, str])
     stream.close()
 
 
-def test_a_share_in_use_is_told_with_its_weight_and_the_host_as_full(console: Console, waiting: dict[str, str]) -> None:
+def test_a_share_in_use_is_shown_with_its_weight_and_the_host_as_full(
+    console: Console, waiting: dict[str, str]
+) -> None:
     definition = console.register("runs", cpus="1", command=["sleep", "600"])
     job = {"jobName": "runs", "jobQueue": "shared", "jobDefinition": definition, "shareIdentifier": "admin"}
     running = console.client.batch("SubmitJob", **job)["jobId"]

@@ -72,7 +72,7 @@ def test_verify_reads_every_file_and_names_the_one_that_was_altered(console: Con
     weights.write_bytes(b"weights")
 
 
-def test_what_others_wrote_is_text_and_unknown_models_are_told(visitor: Visitor, fast: Model) -> None:
+def test_what_others_wrote_is_text_and_unknown_models_are_named(visitor: Visitor, fast: Model) -> None:
     page = visitor.page("/models/fast")
     assert HOSTILE in page.text and page.is_inert and "<script>alert" not in page.source
     assert "did you mean fast?" in visitor.page("/models/fats", 404).text

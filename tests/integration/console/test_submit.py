@@ -81,7 +81,7 @@ def test_a_form_that_is_sent_again_leads_to_the_job_that_it_made(console: Consol
         ("timeout", "soon", "expected a duration"),
     ],
 )
-def test_a_wrong_value_is_told_at_its_field(visitor: Visitor, field: str, value: str, words: str) -> None:
+def test_a_wrong_value_is_shown_at_its_field(visitor: Visitor, field: str, value: str, words: str) -> None:
     fields = {**filled(visitor, "Cartpole"), field: value}
     problem = checked(visitor, fields)["problem"]
     assert problem["key"].startswith(field) and words in problem["message"] and problem["line"] > 0
@@ -148,7 +148,7 @@ def test_any_job_is_submitted_as_yaml_with_help_for_the_line_and_its_errors_mark
         ("", "expected an object", 0),
     ],
 )
-def test_what_a_request_must_not_bring_is_told_at_its_line(visitor: Visitor, text: str, words: str, line: int) -> None:
+def test_what_a_request_must_not_bring_is_shown_at_its_line(visitor: Visitor, text: str, words: str, line: int) -> None:
     problem = checked(visitor, {"yaml": text})["problem"]
     assert words in problem["message"] and problem["line"] == line and "root:" not in problem["message"]
     assert words in visitor.submit("/submit", yaml=text).json()["message"]

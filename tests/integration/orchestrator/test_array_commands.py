@@ -37,6 +37,8 @@ def test_show_counts_the_children_of_an_array_and_shows_one_by_its_index(shared_
     runs = f"its children have the runs many-{array[:8]}-0 to many-{array[:8]}-2; name one, such as many-{array[:8]}-0"
     refused(["resume", f"many-{array[:8]}"], shared_server.home, 2, f"run many-{array[:8]} does not exist", runs)
     refused(["resume", "many"], shared_server.home, 2, "many is a job, not a run", runs)
+    for follow in ([], ["-f"]):
+        assert shared_server.muster("logs", "many", *follow).stderr.endswith("such as: muster logs many:0\n")
 
 
 def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(shared_server: Serving) -> None:
@@ -46,9 +48,6 @@ def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(share
     why = [f"{index} (main node: rank 0 exited with code {index})" for index in (1, 3, 5)]
     reason = f"4 of 9 array jobs failed: {', '.join(why)}, 1 more"
     assert (found["status"], found["statusReason"]) == ("FAILED", reason)
-    assert (
-        shared_server.client.batch("DescribeJobs", jobs=[array])["jobs"][0]["statusReason"] == "Array Child Job failed"
-    )
     states = [(each["index"], each["status"]) for each in found["children"]]
     assert states == [*((i, "FAILED") for i in (1, 3, 5, 7)), *((i, "SUCCEEDED") for i in (0, 2, 4, 6, 8))]
     assert all(each["ranSeconds"] >= 0 for each in found["children"])
@@ -58,6 +57,9 @@ def test_an_array_tells_which_of_its_children_failed_and_lists_these_first(share
     listed = [line.split(maxsplit=3) for line in lines if line.split()[1:2] in (["FAILED"], ["SUCCEEDED"])]
     assert [int(each[0]) for each in listed] == [1, 3, 5, 7, 0, 2, 4, 6, 8]
     assert listed[3][3] == "main node: rank 0 exited with code 7" and listed[0][2].startswith("0:00:0")
+    hint = f"odd ({array[:8]}) is an array, whose children have the logs, such as: muster logs odd:1\n"
+    done = shared_server.muster("logs", "odd")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", hint)
 
 
 def test_an_array_that_waits_says_why_its_first_child_does(server: Serving) -> None:
@@ -89,18 +91,3 @@ def test_an_array_that_waits_says_why_its_first_child_does(server: Serving) -> N
     server.client.batch("TerminateJob", jobId=waits, reason="enough")
     assert [each.wait(60 * PATIENCE) for each in following.values()] == [0, 0]
     server.client.batch("TerminateJob", jobId=full, reason="enough")
-
-
-def test_the_log_of_an_array_leads_to_that_of_its_first_child_that_failed(shared_server: Serving) -> None:
-    odd, even = (
-        submit_array(shared_server, "logless", 4, "exit $((AWS_BATCH_JOB_ARRAY_INDEX / 2))"),
-        submit_array(shared_server, "fine", 2, "true"),
-    )
-    for name, job, child in (("logless", odd, 2), ("fine", even, 0)):
-        shared_server.wait(job)
-        for follow in ([], ["-f"]):
-            done = shared_server.muster("logs", name, *follow)
-            hint = (
-                f"{name} ({job[:8]}) is an array, whose children have the logs, such as: muster logs {name}:{child}\n"
-            )
-            assert (done.returncode, done.stdout, done.stderr) == (0, "", hint)

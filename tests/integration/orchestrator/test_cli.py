@@ -11,7 +11,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +18,7 @@ import httpx
 import pytest
 from rich.table import Table
 
-from orchestrator.cli.shown_jobs import _gpus
-from orchestrator.cli.terminal import print_cut, print_rows, print_wrapped
+from orchestrator.cli.terminal import print_cut
 from tests.conftest import MUSTER, PATIENCE, REPOSITORY, Serving, call_muster, wait_for
 from tests.support.orchestrator.jobs import FOREVER, refusal, refused
 
@@ -87,33 +85,26 @@ def test_commands_without_a_controller_say_how_to_start_one_and_take_no_other(tm
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8080", "localhost:8080", "http://127.0.0.1:80800", "http://", "ftp://x"])
-def test_an_address_that_is_no_url_is_wrong_use(tmp_path: Path, url: str) -> None:
+def test_an_address_that_is_not_a_url_is_wrong_use(tmp_path: Path, url: str) -> None:
     refused(["list"], tmp_path, 2, f"'{url}' is not the URL of a controller", "http://127.0.0.1:8080", MUSTER_URL=url)
 
 
-def test_the_api_s_page_lists_operations_and_needs_nothing_from_elsewhere(
+def test_the_api_s_page_lists_operations_and_no_answer_may_be_framed_or_taken_for_another_type(
     shared_server: Serving,
 ) -> None:
-    answer = httpx.get(f"{shared_server.url}/api/docs", trust_env=False)
-    assert answer.status_code == 200 and "<h2>POST /api/runs/{name}/resume</h2>" in answer.text
+    for path, status in (("/healthz", 200), ("/api/jobs/none", 404), ("/", 403), ("/api/docs", 200)):
+        headers = {"Origin": "http://evil.example"} if status == 403 else {}
+        answer = httpx.get(f"{shared_server.url}{path}", headers=headers, trust_env=False)
+        assert answer.status_code == status and answer.headers["referrer-policy"] == "same-origin"
+        assert answer.headers["x-frame-options"] == "DENY" and answer.headers["x-content-type-options"] == "nosniff"
+        assert all("frame-ancestors 'none'" in each for each in answer.headers.get_list("content-security-policy"))
+    assert "<h2>POST /api/runs/{name}/resume</h2>" in answer.text
     assert "<code>checkpoint</code></td><td>integer or null" in answer.text
     assert re.findall(r"<script|src=|@import|url\(|://|\son\w+=", answer.text) == []
     assert re.findall(r'href="(.*?)"', answer.text) == ["/api/openapi.json"]
     (style,) = re.findall(r"<style>(.*?)</style>", answer.text, re.S)
     allowed = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
     assert f"default-src 'none'; style-src 'sha256-{allowed}';" in answer.headers["content-security-policy"]
-
-
-@pytest.mark.parametrize(
-    ("path", "status"), [("/healthz", 200), ("/api/docs", 200), ("/api/jobs/none", 404), ("/nowhere", 404), ("/", 403)]
-)
-def test_no_answer_may_be_framed_or_taken_for_another_type(shared_server: Serving, path: str, status: int) -> None:
-    headers = {"Origin": "http://evil.example"} if status == 403 else {}
-    answer = httpx.get(f"{shared_server.url}{path}", headers=headers, trust_env=False)
-    assert answer.status_code == status
-    assert answer.headers["x-frame-options"] == "DENY" and answer.headers["x-content-type-options"] == "nosniff"
-    assert answer.headers["referrer-policy"] == "same-origin"
-    assert all("frame-ancestors 'none'" in policy for policy in answer.headers.get_list("content-security-policy"))
 
 
 def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
@@ -125,6 +116,10 @@ def test_unknown_jobs_and_runs_are_named(shared_server: Serving) -> None:
             refused([command, name], shared_server.home, 2, f"{name!r} names nothing{more}")
     detail = shared_server.wait(shared_server.gang("pass", name="plain"))
     refused(["resume", detail["run"]], shared_server.home, 2, "was not started from a YAML spec")
+    created = (
+        f"{detail['run']} is a run (created by job plain ({detail['id'][:8]})); try: muster show {detail['id'][:8]}"
+    )
+    refused(["show", detail["run"]], shared_server.home, 2, created)
 
 
 def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server: Serving, tmp_path: Path) -> None:
@@ -152,35 +147,19 @@ def test_submit_list_show_logs_and_stop_work_from_another_terminal(shared_server
     assert "FAILED already" in shared_server.muster("stop", "greeter").stdout
 
 
-def table(*rows: tuple[str, ...]) -> Table:
-    """As ``muster list`` makes it: its last column alone may be cut."""
-    made = Table(box=None, pad_edge=False)
-    for column in ("JOB", "NAME", "STATUS", "REASON"):
-        made.add_column(column, no_wrap=True, overflow="ellipsis" if column == "REASON" else "fold")
-    for row in rows:
-        made.add_row(*row)
-    return made
-
-
 def test_a_narrow_terminal_cuts_reasons(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.setenv("COLUMNS", "60")
     monkeypatch.setenv("NO_COLOR", "1")
-    long = ("0123abcd", "a-job-of-that-name", "[red]FAILED[/]", "node 2: " + "a long story " * 20)
-    print_cut(table(long, ("4567abcd", "another", "RUNNABLE", "waits")))
+    table = Table(box=None, pad_edge=False)
+    for column in ("JOB", "NAME", "STATUS", "REASON"):
+        table.add_column(column, no_wrap=True, overflow="ellipsis" if column == "REASON" else "fold")
+    table.add_row("0123abcd", "a-job-of-that-name", "[red]FAILED[/]", "node 2: " + "a long story " * 20)
+    table.add_row("4567abcd", "another", "RUNNABLE", "waits")
+    print_cut(table)
     _, first, second = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert first[:3] == ["0123abcd", "a-job-of-that-name", "FAILED"] and first[-1].endswith("…")
     assert second == ["4567abcd", "another", "RUNNABLE", "waits"]
-
-
-@pytest.mark.parametrize("printing", [print_cut, print_wrapped, print_rows])
-def test_for_another_program_a_long_row_of_any_table_pads_no_other(
-    printing: Callable[[Table], None], capsys: pytest.CaptureFixture[str]
-) -> None:
-    printing(table(("0123abcd", "a-job", "FAILED", "a long story " * 2000), ("4567abcd", "b", "RUNNABLE", "")))
-    header, long, short = capsys.readouterr().out.splitlines()
-    assert header.split() == ["JOB", "NAME", "STATUS", "REASON"] and long.count("story") == 2000
-    assert short == "4567abcd  b      RUNNABLE" and not any(each.endswith(" ") for each in (header, long, short))
 
 
 def test_no_table_that_is_read_by_another_program_ends_in_spaces(shared_server: Serving) -> None:
@@ -232,23 +211,7 @@ def test_ctrl_c_while_the_job_waits_ends_it_as_one_that_never_started(server: Se
     refused(["resume", server.detail(job["jobId"])["run"]], server.home, 2, never)
 
 
-def test_who_follows_a_command_that_waits_is_told_why(server: Serving) -> None:
-    server.wait(full := server.gang(FOREVER, cpus="4"), "RUNNING")
-    env = {**os.environ, "MUSTER_HOME": str(server.home)}
-    options: dict[str, Any] = {"env": env, "cwd": REPOSITORY, "stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    following = [subprocess.Popen([MUSTER, "submit", "job_specs/all-reduce.yaml", "-f"], text=True, **options)]
-    wait_for(lambda: '"all-reduce"' in server.muster("list", "--json").stdout, 30, "its submission")
-    following.append(subprocess.Popen([MUSTER, "logs", "all-reduce", "-f"], text=True, **options))
-    for each in following:
-        assert each.stderr is not None
-        line = each.stderr.readline()
-        assert line.startswith("all-reduce (") and f": waits for job test ({full[:8]}) to end: " in line, line
-    server.client.batch("TerminateJob", jobId=full, reason="enough")
-    for each in following:
-        assert each.communicate(timeout=60 * PATIENCE)[1].count("RUNNABLE") == 0 and each.returncode == 0
-
-
-def test_who_follows_a_log_is_told_again_when_the_reason_changes(server: Serving, tmp_path: Path) -> None:
+def test_who_follows_a_log_is_notified_again_when_the_reason_changes(server: Serving, tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     script = f"import os, signal, time\nsignal.signal(15, signal.SIG_IGN)\nwhile not os.path.exists({str(gate)!r}): time.sleep(0.05)"
     server.wait(full := server.gang(script, cpus="4"), "RUNNING")
@@ -311,31 +274,14 @@ def test_a_server_and_short_commands_that_start_together_all_succeed(tmp_path: P
         assert server.communicate(timeout=60 * PATIENCE)[1] == "" and server.returncode == 0
 
 
-@pytest.mark.parametrize(
-    ("node", "output"),
-    [
-        ({"host": "localhost", "gpus": ["2", "3"]}, ", GPUs 2,3"),
-        ({"host": "ray/n1", "gpus": ["0", "1"]}, ", 2 GPUs"),
-        ({"host": "ray/n1", "gpus": ["0"], "devices": ["5"]}, ", GPUs 5"),
-        ({"host": "slurm/n1", "gpus": ["0"]}, ", 1 GPU"),
-        ({"host": "ray/n1", "gpus": []}, ""),
-    ],
-)
-def test_show_names_gpus_only_where_it_is_known_which_they_are(node: dict[str, Any], output: str) -> None:
-    assert _gpus(node) == output
-
-
 # -- muster doctor ----------------------------------------------------------------------------------------------------
 
 
-def test_all_requirements_are_installed(tmp_path: Path) -> None:
+def test_all_requirements_are_installed_and_a_controller_is_found(shared_server: Serving, tmp_path: Path) -> None:
     done = call_muster("doctor", "--worker", "--engine", "local", home=tmp_path)
     assert done.returncode == 0, done.stdout + done.stderr
     for output in ("torch 2.", "a durable write takes", "muster serve starts one", "1 host, "):
         assert output in done.stdout
-
-
-def test_a_controller_is_found(shared_server: Serving) -> None:
     found = json.loads(shared_server.muster("doctor", "--json").stdout)
     [controller] = [each for each in found if each["what"] == "controller"]
     assert (controller["state"], controller["text"]) == ("ok", f"{shared_server.url}, engines local")

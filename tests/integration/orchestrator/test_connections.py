@@ -186,15 +186,6 @@ def test_a_slow_reader_gets_all_of_a_large_answer(address_of_large: tuple[str, i
             time.sleep(0.01)
 
 
-def test_the_limit_of_open_files_is_raised_as_far_as_it_may_be() -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    try:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (min(soft, 512), hard))
-        assert raise_descriptor_limit() == resource.getrlimit(resource.RLIMIT_NOFILE)[0] == min(hard, 65_536)
-    finally:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
-
-
 def test_a_job_has_the_limit_of_open_files_that_the_controller_was_started_with(tmp_path: Path) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     limit = 600 + len(os.listdir("/proc/self/fd"))
@@ -208,7 +199,7 @@ def test_a_job_has_the_limit_of_open_files_that_the_controller_was_started_with(
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_clients_that_take_no_answer_give_way_or_a_new_one_is_told(
+def test_clients_that_take_no_answer_give_way_or_a_new_one_is_refused(
     inside: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     held: connections.Connections = inside._uvicorn.config.http.args[0]

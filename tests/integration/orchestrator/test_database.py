@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -31,7 +29,6 @@ from orchestrator.persistence.batch_models import (
     Job,
     JobQueue,
     Node,
-    RunRecord,
     now,
 )
 from orchestrator.persistence.own_models import RetentionStart, RunUse
@@ -40,7 +37,7 @@ from orchestrator.persistence.queries import find_job
 from orchestrator.persistence.schema import NEWEST
 from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from tests.conftest import REPOSITORY, Serving, wait_for
+from tests.conftest import Serving, wait_for
 from tests.support.orchestrator import postgres
 from tests.support.orchestrator.databases import connected, lift_whole, make_older
 from tests.support.orchestrator.rows import job
@@ -88,6 +85,7 @@ def test_a_new_and_a_migrated_database_match_the_tables(url: str, opened: Callab
     with database.session() as session:
         assert [queue.name for queue in session.scalars(select(JobQueue))] == ["default"]
         assert [each.name for each in session.scalars(select(ComputeEnvironment))] == ["local"]
+        assert (session.get(RetentionStart, 1) is None) is (history == "new"), "a new one has nothing to count from"
 
 
 def test_a_database_of_the_first_version_is_migrated_with_its_jobs(url: str, opened: Callable[[], Database]) -> None:
@@ -162,41 +160,6 @@ def test_an_older_database_begins_with_retention_at_its_upgrade(url: str, opened
         assert uses == {("open", "read"), ("open", "teacher"), ("open", "parent")}
 
 
-def test_a_new_database_has_nothing_to_count_from(opened: Callable[[], Database]) -> None:
-    with opened().session() as session:
-        assert session.get(RetentionStart, 1) is None
-
-
-def test_children_of_an_array_stored_with_copies_share_its_definition(url: str, opened: Callable[[], Database]) -> None:
-    make_older(url, "0003")
-    facts = {**OLD, "node_properties": '{"numNodes": 1}', "status": "RUNNABLE", "created_at": 5, "attempts_allowed": 3}
-    family = (("p", "array", None), ("p:0", "container", "p"), ("alone", "container", None))
-    rows = [{"id": name, "run": name, "kind": kind, "parent": parent} for name, kind, parent in family]
-    insert(url, "jobs", [{**facts, "tags": '{"a": "b"}', **row} for row in rows])
-    lift_whole(url)
-    with opened().session() as session:
-        stored = dict(session.execute(text("SELECT id, node_properties IS NULL FROM jobs")).tuples().all())
-        assert {name: bool(shared) for name, shared in stored.items()} == {"p": False, "p:0": True, "alone": False}
-        for name in ("p", "p:0", "alone"):
-            job_ = session.get_one(Job, name)
-            assert (job_.node_properties, job_.tags, job_.parameters) == ({"numNodes": 1}, {"a": "b"}, {})
-
-
-def test_runs_of_an_older_database_belong_to_their_first_job_s_owner(url: str, opened: Callable[[], Database]) -> None:
-    make_older(url, "0004")
-    facts = {**OLD, "status": "FAILED", "attempts_allowed": 1}
-    found = [("a", "lab", "key x/1/2", 1), *((run, "default", None, epoch) for run, epoch in (("a", 2), ("b", 1)))]
-    found.append(("c", "lab", None, None))
-    columns = ("run", "queue", "idempotency_key", "first_epoch")
-    rows = [{"id": f"j{i}", "created_at": i, **dict(zip(columns, row, strict=True))} for i, row in enumerate(found)]
-    insert(url, "jobs", [{**facts, **row} for row in rows])
-    lift_whole(url)
-    with opened().session() as session:
-        runs = {run.name: (run.queue, run.owner) for run in session.scalars(select(RunRecord))}
-        assert runs == {"a": ("lab", "key x"), "b": ("default", None)}  # c never started: there is no run of it
-        assert session.get_one(Job, "j0").owner == "key x"
-
-
 def test_sqlite_watches_what_refers_to_what(tmp_path: Path) -> None:
     database = Database.at(tmp_path)
     with pytest.raises(IntegrityError), database.session() as session:
@@ -217,19 +180,6 @@ def test_an_older_database_is_refused_with_the_command_that_lifts_it(url: str, r
     lift_whole(url)
     lift_whole(url)
     Database(url).close()
-
-
-@pytest.mark.parametrize(
-    ("name", "words"), [("none.db", "there is no such file"), ("newer.db", "not a database of an older Muster")]
-)
-def test_what_is_not_an_older_database_is_not_lifted(tmp_path: Path, name: str, words: str) -> None:
-    database = Database(f"sqlite:///{tmp_path}/newer.db")
-    with database.engine.begin() as connection:
-        connection.execute(text("UPDATE alembic_version SET version_num = '9999'"))
-    database.close()
-    command = [sys.executable, "-m", "docs.tools.lift_database", str(tmp_path / name)]
-    done = subprocess.run(command, cwd=REPOSITORY, capture_output=True, text=True)
-    assert done.returncode == 2 and words in done.stderr and done.stderr.count("\n") == 1
 
 
 def test_a_database_of_a_newer_version_is_refused_in_one_line(url: str, opened: Callable[[], Database]) -> None:
@@ -279,6 +229,8 @@ def test_a_controller_that_lost_its_database_refuses_writes_alone(postgresql: po
     url = postgresql.new_database()
     losing = Server(tmp_path, database=url)
     losing.start()
+    with pytest.raises(DatabaseError, match="another controller has it"):
+        Database(url)
     other, waiter = create_engine(url).connect(), create_engine(url).connect()
     lock = f"SELECT pg_advisory_lock({0x6D7573746572})"
     waiting = threading.Thread(target=waiter.execute, args=(text(lock),), daemon=True)
@@ -338,13 +290,6 @@ def test_the_work_queue_is_the_same_after_a_restart(opened: Callable[[], Databas
         assert sorted(work_queue.take_due()) == due, "what was pending may have become ready while nobody looked"
 
 
-def test_a_stop_during_a_write_of_the_controller_is_processed() -> None:
-    work_queue, stale = WorkQueue(), job("a", status="RUNNABLE")
-    work_queue.look_again(["a"])  # a request has just ended the job
-    work_queue.note([stale])  # the controller commits what it had read before
-    assert list(work_queue.take_due()) == ["a"]
-
-
 def test_an_attempt_is_charged_for_its_use_and_losses(opened: Callable[[], Database]) -> None:
     def nodes() -> list[Node]:
         return [Node(host="h", gpus=gpus, cpus=4.0, memory=1) for gpus in (("0", "1"), ("2", "3"))]
@@ -380,29 +325,6 @@ def test_a_job_is_found_by_id_name_or_beginning(opened: Callable[[], Database]) 
         ):
             find_job(session, "aaaa")
     assert found == ["aaaa1111", "aaaa2222", "aaaa2222", None, "aaaa2222:0"]
-
-
-def test_a_controller_with_a_lost_lock_takes_it_again_or_names_its_owner(postgresql: postgres.Server) -> None:
-    url = postgresql.new_database()
-    database, others = Database(url), create_engine(url)
-
-    def cut() -> None:
-        with others.connect() as connection:
-            locks = "pg_locks WHERE locktype = 'advisory' AND pid != pg_backend_pid()"
-            connection.execute(text(f"SELECT pg_terminate_backend(pid) FROM {locks}"))
-
-    cut()
-    database.keep_lock()
-    with pytest.raises(DatabaseError, match="another controller has it"):
-        Database(url)
-    cut()
-    second = Database(url)
-    with pytest.raises(DatabaseError, match="another controller has it"):
-        database.keep_lock()
-    second.close()
-    database.keep_lock()
-    database.close()
-    others.dispose()
 
 
 def test_a_controller_on_postgresql_runs_jobs_and_is_succeeded(postgresql: postgres.Server, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from tests.support.waiting import wait_for
 
 
 class FullEngine(FakeEngine):
-    """It has no room while it is said to be full."""
+    """It has no room while it is full."""
 
     is_full = False
 

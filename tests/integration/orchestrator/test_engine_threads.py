@@ -1,4 +1,4 @@
-"""Engines that hang, fail, are full, or queue by themselves: each on its own thread, none in the way of another; what is told of them."""
+"""Engines that hang, fail, are full, or queue by themselves: each on its own thread, none in the way of another; and what is reported of them."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ import os
 import re
 import resource
 import subprocess
-import time
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import httpx
 import pytest
@@ -83,96 +82,19 @@ def observed(several: EngineSet, handle: str) -> GangStatus | None:
     return several.observe(handle)
 
 
-@pytest.mark.parametrize(
-    ("number", "final"),
-    [
-        *((name, False) for name in ("EMFILE", "ENFILE", "EAGAIN", "ENOMEM", "ESTALE", "ENOSPC", "EIO", "EDQUOT")),
-        *((name, False) for name in ("EROFS", "ETIMEDOUT", "ECONNREFUSED", "EBUSY", "EINTR")),
-        *((name, True) for name in ("ENOENT", "ENOTDIR", "EACCES", "EPERM", "E2BIG", "ENAMETOOLONG", "ENOEXEC")),
-    ],
-)
-def test_transient_errors_are_retried_and_others_are_final(number: str, final: bool) -> None:
-    error = OSError(getattr(errno, number), number)
-    with pytest.raises(EngineError) as raised:
-        refused_plan(error)
-    assert isinstance(raised.value, Transient) is not final
+TRANSIENT = "EMFILE ENFILE EAGAIN ENOMEM ESTALE ENOSPC EIO EDQUOT EROFS ETIMEDOUT ECONNREFUSED EBUSY EINTR"
+FINAL = "ENOENT ENOTDIR EACCES EPERM E2BIG ENAMETOOLONG ENOEXEC"
 
 
-def test_an_error_without_a_number_is_not_final() -> None:
-    with pytest.raises(Transient, match="a library's own"):
-        refused_plan(OSError("a library's own"))
-
-
-def refused_plan(error: OSError) -> None:
-    """Plan a gang on an engine that raises this error."""
+def test_transient_errors_and_those_without_a_number_are_retried_and_others_are_final() -> None:
     engine = FakeEngine()
-    requested = runner.Runner(engine, lambda _: None)
-    engine.plan = lambda gang: (_ for _ in ()).throw(error)  # type: ignore[method-assign]
-    try:
-        requested.plan(make_gang(Path("/")))
-    finally:
-        requested.close()
-
-
-def test_an_engine_that_hangs_keeps_nobody_waiting_and_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(runner, "OVERDUE", 0.2)
-    fake = FakeEngine()
-    with engines(fake) as several:
-        handle = launched(several, gang(tmp_path))
-        wait_for(lambda: observed(several, handle), 10, "the first picture")
-        changed: list[str] = []
-        several.changed = changed.append
-        fake.answers.clear()
-        before = time.monotonic()
-
-        def says() -> str:
-            [node] = observed(several, handle) or []
-            assert node.running and node.address == "10.0.0.1"
-            return node.words
-
-        output = wait_for(says, 10, "that it does not answer")
-        assert output.startswith("the fake engine has not answered since "), output
-        assert changed == [read_handle(handle).gang], "its job is looked at, since its reason is another one now"
-        assert several.capacity(patience=60) == {"fake": fake.offered}, "what it told last"
-        with pytest.raises(NotYet, match="has not answered since") as wait:
-            several.launch("other/1/1", [HOST], lambda: several.plan(gang(tmp_path, "other")))
-        assert wait.value.unknown, "it may have been started"
-        assert time.monotonic() - before < 30
-        changed.clear()
-        fake.answers.set()
-        wait_for(lambda: not says(), 10, "that it answers again")
-        assert read_handle(handle).gang in changed
-        launched(several, gang(tmp_path, "other"))
-    assert [record.getMessage() for record in caplog.records] == [output, "the fake engine answers again"]
-    assert fake.threads == {"engine fake"}, "the constructor's thread calls no engine"
-    assert fake.closed == 1
-
-
-def test_an_engine_that_fails_is_logged_once_its_gangs_run(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    fake = FakeEngine()
-    with engines(fake) as several:
-        handle = launched(several, gang(tmp_path))
-        wait_for(lambda: observed(several, handle), 10, "the first picture")
-        for error, output in (
-            (OSError(errno.EMFILE, "Too many"), "can't look at its gangs now ([Errno 24] Too many)"),
-            (RuntimeError("no\nwords"), "failed to look at its gangs (RuntimeError: no words)"),
-        ):
-            fake.error = error
-            [node] = wait_for(
-                lambda output=output: (s := observed(several, handle)) and output in s[0].words and s,
-                20,
-                output,
-            )
-            assert node.running
-            with pytest.raises(EngineError, match="trying again"):
-                several.stop(handle, 0)
-        fake.error = None
-        wait_for(lambda: (s := observed(several, handle)) and not s[0].words, 20, "that it is seen again")
-        assert [node.running for node in several.stop(handle, 0)] == [False]
-    looks = [record for record in caplog.records if "look at its gangs" in record.getMessage()]
-    assert len(looks) == 2 and [bool(record.exc_info) for record in looks] == [False, True], caplog.text
+    with contextlib.closing(runner.Runner(engine, lambda _: None)) as requested:
+        for name in (*TRANSIENT.split(), *FINAL.split(), "of a library"):
+            error = OSError(getattr(errno, name), name) if name.isupper() else OSError(name)
+            engine.plan = mock.Mock(side_effect=error)  # type: ignore[method-assign]
+            with pytest.raises(EngineError) as raised:
+                requested.plan(make_gang(Path("/")))
+            assert isinstance(raised.value, Transient) is (name not in FINAL.split()), name
 
 
 def test_without_descriptors_no_gang_counts_as_dead_and_no_half_gang_is_started(tmp_path: Path) -> None:
@@ -380,17 +302,7 @@ def test_gangs_are_handed_over_although_others_run_there(queued: Client, engine:
     assert len(engine.cluster.launched) == 3 and hosts == {"fake/q"}
 
 
-def test_a_node_is_on_the_host_that_the_engine_tells_later(queued: Client, engine: FakeEngine) -> None:
-    job = submit_gang(queued, "pass", nodes=2)
-    [attempt] = await_status(queued, job, "RUNNING")["attempts"]
-    assert attempt["computeEnvironment"] == "fake" and [node["host"] for node in attempt["nodes"]] == ["fake/q"] * 2
-    [nodes] = engine.cluster.gangs.values()
-    nodes[1] = replace(nodes[1], host="fake/m7")
-    hosts = lambda: [node["host"] for node in detail(queued, job)["attempts"][0]["nodes"]]  # noqa: E731
-    wait_for(lambda: hosts() == ["fake/q", "fake/m7"], 20, "the host")
-
-
-def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_called_a_host(queued: Client) -> None:
+def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_a_host(queued: Client, engine: FakeEngine) -> None:
     limit = "queue fake/q gives a gang at most 8 CPUs, 2 GPUs, 8 GiB"
     for nodes, cpus, needs in (
         (1, "12", "each node needs 12 CPUs, 0 GPUs, 64 MiB"),
@@ -399,9 +311,6 @@ def test_a_gang_beyond_the_limit_is_refused_and_the_limit_is_not_called_a_host(q
         with pytest.raises(ApiError) as refused:
             queued.post("/api/plan", {"definition": multinode("a", container(cpus=cpus), nodes)})
         assert str(refused.value).endswith(f"{needs}; {limit}")
-
-
-def test_its_limit_is_told_apart_from_hosts(queued: Client, engine: FakeEngine) -> None:
     reported = queued.get("/api/capacity")
     assert reported["hosts"] == []
     assert reported["queued"] == {"fake": {"queue": "fake/q", "cpus": 8.0, "gpus": 2, "memory": 8192}}

@@ -79,16 +79,10 @@ def test_a_run_whose_task_is_not_installed_is_refused_with_the_same_line(full: S
     assert output.rstrip().endswith("(your own: module:Class; if a plug-in provides it, install the plug-in's package)")
 
 
-def test_a_plan_of_a_run_whose_task_is_not_installed_is_refused(full: Serving, tmp_path: Path) -> None:
-    spec = tmp_path / "judge.yaml"
-    spec.write_text(json.dumps({"name": "judge", "evaluate": {"run": "gone"}}))
-    for options in ([], ["--dry-run"]):
-        assert "run gone: train.task: no task is called 'Vanished'" in refusal(full, "submit", str(spec), *options)
-
-
 def test_a_job_from_yaml_is_checked_as_the_command_s_is(full: Serving, tmp_path: Path) -> None:
     spec = tmp_path / "judge.yaml"
     for section, output in (
+        ({"run": "gone"}, "run gone: train.task: no task is called 'Vanished'"),
         ({"checkpoint": 4}, "no checkpoint of iteration 4"),
         ({"config": {"angel_limit": 1}}, "did you mean angle_limit?"),
         ({"checkpoint": "new"}, "evaluate.checkpoint: expected an iteration, best or latest, found 'new'"),
@@ -126,9 +120,6 @@ def test_compare_puts_seeds_into_one_group_and_draws_curves(full: Serving, tmp_p
     assert drawn == f"written: {picture}" and picture.read_bytes().startswith(b"\x89PNG")
     (group, _) = json.loads(full.muster("compare", "taught*", "slow", "--json").stdout)
     assert group["runs"] == ["taught", "taught-b"] and group["evaluated"]["mean"] == 27.0
-
-
-def test_the_curves_are_written_as_numbers_too(full: Serving, tmp_path: Path) -> None:
     table = tmp_path / "curves.csv"
     assert full.muster("compare", "taught", "slow", "-o", str(table)).returncode == 0
     header, *rows = table.read_text().splitlines()
@@ -136,7 +127,7 @@ def test_the_curves_are_written_as_numbers_too(full: Serving, tmp_path: Path) ->
     assert rows[0] == "taught,100.0,10.0,0.0,1" and rows[-1] == "slow,900.0,3.0,0.0,1"
 
 
-def test_compare_refuses_what_it_can_not_compare(full: Serving, tmp_path: Path) -> None:
+def test_compare_refuses_what_it_cannot_compare(full: Serving, tmp_path: Path) -> None:
     for options, output in (
         (["taught"], "that is one run, taught; name two or more to compare"),
         (["taught", "slwo"], "did you mean slow"),

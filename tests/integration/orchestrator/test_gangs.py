@@ -6,27 +6,12 @@ import json
 import os
 import signal
 import subprocess
-import threading
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from orchestrator.console.formats import ran
-from orchestrator.domain import attempt, gang_checks
-from orchestrator.domain.gang import GangSpec, gang_needs
-from orchestrator.engines.api import EngineError
-from orchestrator.engines.local.engine import LocalEngine
-from orchestrator.persistence import gangs
-from orchestrator.spec.compile import compile_definition
-from orchestrator.spec.model import validate
-from shared_store.volume.layout import Store
-from shared_store.volume.log_view import Chosen
-from shared_store.volume.log_windows import first_error
 from tests.conftest import MAIN_LAST, MUSTER, PATIENCE, Serving, submit_gang, wait_for
-from tests.support.definitions import container, single, submission_of
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
 from tests.support.processes import processes_of
 
@@ -36,15 +21,6 @@ NATIVE = {"MUSTER_ON_CHILD_FAILURE": "restart"}
 def until(gate: Path) -> str:
     """A line of a script that imports ``time``: wait until there is a file."""
     return f"while not __import__('os').path.exists({str(gate)!r}): time.sleep(0.02)"
-
-
-def test_on_child_failure_fail_ends_the_job_at_once(shared_server: Serving) -> None:
-    script = (
-        f"import os\nif os.environ['AWS_BATCH_JOB_NODE_INDEX'] == '1': raise RuntimeError('child trouble')\n{FOREVER}"
-    )
-    job = shared_server.gang(script, nodes=2, attempts=5, env={"MUSTER_ON_CHILD_FAILURE": "fail"})
-    detail = shared_server.wait(job)
-    assert detail["status"] == "FAILED" and len(detail["attempts"]) == 1 and "child trouble" in detail["statusReason"]
 
 
 FAULTY = "import os\ndef reward():\n  raise ValueError(os.environ['AWS_BATCH_JOB_ATTEMPT'])\nreward()"
@@ -69,64 +45,6 @@ def test_a_job_of_the_batch_api_is_tried_as_often_as_it_says_whatever_its_fault(
     words = "main node: rank 0 exited with code 1: ValueError: 3"
     assert found["statusReason"] == found["attempts"][-1]["statusReason"] == words
     assert found["awsCode"] == "Essential container in task exited"
-
-
-def test_a_program_that_is_missing_is_the_reason_everywhere_but_in_the_batch_api(shared_server: Serving) -> None:
-    client = shared_server.client
-    client.batch("RegisterJobDefinition", **single("lost", container(command=["no-such-program"])))
-    job = client.batch("SubmitJob", jobName="lost", jobQueue="default", jobDefinition="lost")["jobId"]
-    found = shared_server.wait(job)
-    own = "can't start 'no-such-program': No such file or directory; is it installed, and is the path right?"
-    assert found["statusReason"] == found["attempts"][0]["statusReason"] == f"main node: {own}"
-    assert found["attempts"][0]["nodes"][0]["exitCode"] == 127
-    shown = " ".join(shared_server.muster("show", job).stdout.split())
-    assert f"why: main node: {own} in AWS's API: Task failed to start" in shown
-    assert f"main node: {own}" in shared_server.muster("list").stdout
-    [described] = client.batch("DescribeJobs", jobs=[job])["jobs"]
-    assert described["statusReason"] == described["attempts"][0]["statusReason"] == "Task failed to start"
-    run = Store(shared_server.home / "store").run(found["run"])
-    assert [each.text for each in first_error(Chosen(run, job), {}).lines] == [own]
-
-
-def test_a_job_has_run_as_long_as_all_its_attempts_together_wherever_it_is_asked(shared_server: Serving) -> None:
-    job = shared_server.gang("import time; time.sleep(1.2); exit(3)", attempts=3, name="thrice")
-    found = shared_server.wait(job)
-    spans = [each["stoppedAt"] - each["startedAt"] for each in found["attempts"]]
-    assert len(spans) == 3 and found["ranSeconds"] == sum(spans) / 1000 >= 3.6 and found["runsSince"] is None
-    (row,) = shared_server.client.get("/api/jobs", search=job)["jobs"]
-    assert row["ranSeconds"] == found["ranSeconds"]
-    seconds = int(found["ranSeconds"])
-    shown = shared_server.muster("show", job).stdout
-    assert f"took:         0:00:{seconds:02}\n" in shown
-    (line,) = [each for each in shared_server.muster("list").stdout.splitlines() if each.startswith(job[:8])]
-    assert f" 0:00:{seconds:02} " in line
-    assert [ran(found), ran(row)] == [f"{seconds} s"] * 2
-
-
-def test_two_faults_in_a_row_and_a_failure_without_one_are_tried_again(shared_server: Serving) -> None:
-    script = (
-        "import os\nattempt = int(os.environ['AWS_BATCH_JOB_ATTEMPT'])\n"
-        "if attempt == 1: [][1]\nif attempt == 2: {}[1]\nif attempt == 3: open('missing')\nif attempt == 4: {}[1]"
-    )
-    found = shared_server.wait(shared_server.gang(script, attempts=5, env=NATIVE))
-    faults = [
-        "IndexError in <string>, line 3",
-        "KeyError in <string>, line 4",
-        None,
-        "KeyError in <string>, line 6",
-        None,
-    ]
-    assert found["status"] == "SUCCEEDED" and [each["fault"] for each in found["attempts"]] == faults
-
-
-def test_leaving_on_request_requeues_without_spending_an_attempt(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(attempt, "SHORTEST_REQUEUE", 0)
-    script = "import os; raise SystemExit(75 * (os.environ['AWS_BATCH_JOB_ATTEMPT'] == '1'))"
-    with serving(tmp_path) as client:
-        found = await_status(client, submit_gang(client, script, env=NATIVE), "SUCCEEDED", "FAILED")
-    assert found["status"] == "SUCCEEDED" and [each["spent"] for each in found["attempts"]] == [False, True]
 
 
 def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving, tmp_path: Path) -> None:
@@ -154,68 +72,6 @@ def test_a_controller_killed_in_mid_run_finds_its_gang_again(server: Serving, tm
     followed = [json.loads(line) for line in [first, *follower.communicate(timeout=30 * PATIENCE)[0].splitlines()]]
     for rank in (0, 1):  # the follower took up where it was: no line twice, none left out
         assert [line["text"] for line in followed if line["rank"] == rank] == [f"tick {i}" for i in range(60)]
-
-
-def test_following_a_log_shows_lines_as_they_come_and_ends_with_the_job(shared_server: Serving, tmp_path: Path) -> None:
-    lines = "\n".join(f"print('line {i}')\n{until(tmp_path / str(i))}" for i in range(3))
-    job = shared_server.gang(f"import time\n{lines}")
-    texts = []
-    for line in shared_server.client.logs(job, follow=True):
-        texts.append(line["text"])
-        (tmp_path / texts[-1].removeprefix("line ")).touch()  # the next one is printed once this one has come
-    assert texts == [f"line {i}" for i in range(3)] + ["node 0 ended: done"]
-
-
-def test_a_gang_that_the_engine_can_t_stop_says_so_until_it_can(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    stop, requested, allowed = LocalEngine.stop, [], threading.Event()
-
-    def stop_if_allowed(engine: LocalEngine, handle: str, grace: float) -> None:
-        requested.append(handle)
-        if not allowed.is_set():
-            raise EngineError("not authorized\nto perform TerminateJob")
-        stop(engine, handle, grace)
-
-    monkeypatch.setattr(LocalEngine, "stop", stop_if_allowed)
-    with serving(tmp_path) as client:
-        job = submit_gang(client, FOREVER)
-        await_status(client, job, "RUNNING")
-        client.batch("TerminateJob", jobId=job, reason="enough")
-        wait_for(lambda: len(requested) > 1, 30, "another try")
-        output = "attempt 1 can't be stopped: not authorized to perform TerminateJob; trying again"
-        found = detail(client, job)
-        assert (found["status"], found["statusReason"]) == ("RUNNING", output)
-        allowed.set()
-        assert await_status(client, job, "FAILED")["statusReason"] == "enough"
-    assert [record.getMessage() for record in caplog.records if record.levelname == "ERROR"] == [f"job {job}: {output}"]
-    assert processes_of(tmp_path) == []
-
-
-def test_the_nodes_of_a_job_are_read_once_whoever_needs_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    read: list[int] = []
-    """The number of nodes of each document that is read for its gang, in order."""
-
-    def counting(node_properties: Mapping[str, Any]) -> GangSpec:
-        read.append(node_properties["numNodes"])
-        return gang_needs(node_properties)
-
-    for module in (gang_checks, gangs):
-        monkeypatch.setattr(module, "gang_needs", counting)
-    spec = validate({"name": "say", "command": ["echo", "here"], "resources": {"cpus": 0.1, "memory": 64}}, "job.yaml")
-    with serving(tmp_path) as client:
-        job = submit_gang(client, "pass" + MAIN_LAST, nodes=2, env=NATIVE)
-        await_status(client, job, "SUCCEEDED")
-        assert len(detail(client, job)["attempts"][0]["nodes"]) == 2 and read == [2, 2], "from submission to end"
-        registered = client.batch("RegisterJobDefinition", **compile_definition(spec, str(tmp_path)))
-        submitted = client.batch("SubmitJob", **submission_of(spec, registered["jobDefinitionArn"]))
-        run = await_status(client, submitted["jobId"], "SUCCEEDED")["run"]
-        read.clear()
-        resumed = client.post(f"/api/runs/{run}/resume", {})["jobId"]
-        await_status(client, resumed, "SUCCEEDED")
-        client.batch("DescribeJobs", jobs=[resumed, f"{resumed}#0"])
-        client.batch("ListJobs", multiNodeJobId=resumed, jobStatus="SUCCEEDED")
-    assert read == [1] * 2, "the call is made once more when it has read the store, and nothing after it reads them"
 
 
 STUBBORN = f"import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); print('ready', flush=True); {FOREVER}"

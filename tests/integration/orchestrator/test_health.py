@@ -83,7 +83,7 @@ def test_a_service_manager_hears_that_the_controller_is_ready_alive_and_stopping
             assert server.process.wait(60) == 0
 
 
-def test_a_controller_that_is_not_alive_sends_no_sign_of_life(tmp_path: Path) -> None:
+def test_a_controller_that_is_not_alive_sends_no_heartbeat(tmp_path: Path) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
         manager.bind(str(tmp_path / "notify"))
         manager.settimeout(60)
@@ -102,4 +102,4 @@ def test_a_controller_that_is_not_alive_sends_no_sign_of_life(tmp_path: Path) ->
 def test_the_watchdog_of_another_process_is_not_ours() -> None:
     supplied = {"NOTIFY_SOCKET": "@nobody", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}
     assert ServiceManager(supplied).interval is None and supplied == {}
-    ServiceManager({"NOTIFY_SOCKET": "@nobody"}).report("READY=1")  # a manager that is gone is no error
+    ServiceManager({"NOTIFY_SOCKET": "@nobody"}).report("READY=1")  # a manager that is gone is ignored

@@ -190,7 +190,7 @@ def test_a_job_is_read_whatever_it_put_in_place_of_files(
 ) -> None:
     secret = tmp_path / "secret"
     secret.write_text("2026-01-01T00:00:00.000Z 0 o not yours\n")
-    job = submit_gang(Client(inside.url), "print('said')")
+    job = submit_gang(Client(inside.url), "print('printed')")
     wait_for(lambda: http.get(f"/api/jobs/{job}").json()["status"] == "SUCCEEDED", 60, "its end")
     run = inside.store.run(http.get(f"/api/jobs/{job}").json()["run"])
     (run.path / "run.json").write_text("{")
@@ -205,7 +205,7 @@ def test_a_job_is_read_whatever_it_put_in_place_of_files(
     assert (detail["status"], detail["results"], detail["progress"]) == ("SUCCEEDED", None, None)
     for follow in ("false", "true"):
         lines = http.get(f"/api/jobs/{job}/logs", params={"follow": follow}).text
-        assert "said" in lines and "not yours" not in lines
+        assert "printed" in lines and "not yours" not in lines
 
 
 def test_links_and_pipes_that_a_job_put_in_place_of_files_are_neither_followed_nor_waited_for(tmp_path: Path) -> None:
@@ -268,7 +268,7 @@ def test_logs_and_outcomes_are_neither_read_nor_written_through_a_link(tmp_path:
 def test_a_log_stream_ends_in_order_whatever_lies_there(
     inside: Server, http: httpx.Client, caplog: pytest.LogCaptureFixture
 ) -> None:
-    job = submit_gang(Client(inside.url), "print('said')")
+    job = submit_gang(Client(inside.url), "print('printed')")
     wait_for(lambda: http.get(f"/api/jobs/{job}").json()["status"] == "SUCCEEDED", 60, "its end")
     logs = inside.store.run(http.get(f"/api/jobs/{job}").json()["run"]).path / "logs" / job
     (logs / "²").mkdir()
@@ -276,7 +276,7 @@ def test_a_log_stream_ends_in_order_whatever_lies_there(
     (logs / "1" / "node-².log").write_text("")
     address = f"/api/jobs/{job}/logs"
     for follow in (False, True):
-        assert "said" in http.get(address, params={"follow": follow}).text
+        assert "printed" in http.get(address, params={"follow": follow}).text
         assert http.get(address, params={"follow": follow, "attempt": "9" * 300}).text == ""
     logs.rename(logs.with_name("before"))
     logs.write_text("")

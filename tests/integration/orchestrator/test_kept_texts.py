@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import socket
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -103,16 +101,6 @@ def test_a_text_that_is_lost_while_its_job_waits_ends_the_job_with_one_line(serv
     assert "\n" not in ended["statusReason"] and not (server.home / "store" / "runs" / ended["run"]).exists()
 
 
-def test_many_upload_the_same_and_other_texts_at_once_and_all_are_whole(server: Serving) -> None:
-    sent = [f"text {number % 8}\n" * 5000 for number in range(40)]
-    with ThreadPoolExecutor(16) as threads:
-        list(threads.map(server.client.keep_text, sent))
-    found = kept(server)
-    for text in set(sent):
-        assert found[digest_of(text)].read_text() == text
-    assert not any(name.startswith(".") for name in found)
-
-
 def test_an_upload_that_breaks_off_or_has_another_digest_keeps_nothing(server: Serving) -> None:
     text, before = "half of it is sent\n" * 1000, set(kept(server))
     address = urlsplit(server.url)
@@ -128,15 +116,3 @@ def test_an_upload_that_breaks_off_or_has_another_digest_keeps_nothing(server: S
     large = httpx.put(f"{server.url}/api/texts/{'0' * 64}", content=b"x" * ((1 << 20) + 1))
     assert large.status_code == 413
     assert set(kept(server)) == before
-
-
-def test_a_killed_controller_has_the_text_or_nothing(tmp_path: Path) -> None:
-    with Serving(tmp_path / "home", "--cpus", "1") as server:
-        server.client.keep_text("kept\n")
-        server.client.batch("RegisterJobDefinition", **definition("reads", "kept\n"))
-        server.kill()
-        server.start()
-        job = submitted(server, "reads")
-        server.wait(job, "SUCCEEDED")
-        assert server.log(job)[0] == "text True"
-        assert os.listdir(server.home / "store" / "texts") != []

@@ -1,4 +1,4 @@
-"""The local engine: real supervisors on this machine, found again, told apart, and gone when they are stopped."""
+"""The local engine: real supervisors on this machine, found again, distinguished, and gone when they are stopped."""
 
 from __future__ import annotations
 

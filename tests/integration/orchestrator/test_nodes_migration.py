@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from sqlalchemy import create_engine, select, text
+from sqlalchemy import select, text
 
 from orchestrator.domain.hosts import Placement
-from orchestrator.persistence.batch_models import Attempt, Job, JobQueue, Node
+from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.session import Database
 from shared_store.volume.epoch import Claim, take_epoch
 from shared_store.volume.layout import Store
@@ -65,30 +65,9 @@ def test_every_node_is_a_row_that_says_what_the_json_held(old: str) -> None:
     database.close()
 
 
-def test_queues_keep_their_compute_environments_in_order(old: str) -> None:
-    engine = create_engine(old)
-    with engine.begin() as connection:
-        row = "'lab', 'ENABLED', 5, '[\"b\", \"a\"]', '[]', :no, '{}', 7"
-        columns = "name, state, priority, environments, limits, deleting, tags, created_at"
-        connection.execute(text(f"INSERT INTO job_queues ({columns}) VALUES ({row})"), {"no": False})
-    lift_whole(old)
-    database = Database(old)
-    with database.session() as session:
-        queues = {queue.name: queue.compute_environments for queue in session.scalars(select(JobQueue))}
-        assert queues == {"default": ["local"], "lab": ["b", "a"]}
-        assert {queue.sent_order for queue in session.scalars(select(JobQueue))} == {None}
-    database.close()
-
-
 @pytest.mark.parametrize(
     "damaged",
-    [
-        "[1]",
-        '[{"index": 0, "host": "h", "gpus": 1}]',
-        '[{"index": "x", "host": "h"}]',
-        "{}",
-        '[{"index": 0, "host": "h"}, {}]',
-    ],
+    ["[1]", '[{"index": 0, "host": "h", "gpus": 1}]', "{}", '[{"index": 0, "host": "h"}, {}]'],
 )
 def test_nodes_of_older_and_damaged_attempts_are_read_as_far_as_they_can_be(old: str, damaged: str) -> None:
     reported = {"gpus": ["GPU-a", "GPU-b"], "devices": ["7"], "exitCode": 1, "reason": "a\0b\ud800"}

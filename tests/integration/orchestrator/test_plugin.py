@@ -16,8 +16,6 @@ import pytest
 from shared_store.volume.layout import Store
 from shared_store.volume.references import Needed, references
 from tests.conftest import REPOSITORY, Serving, run_muster
-from tests.support.keys import HomeKeys
-from tests.support.orchestrator.trained import add_run
 from tests.support.plugin_packages import write_package
 
 JOB = "name: noted\nresources: {cpus: 0.1, memory: 16MiB}\ncommand: ['true']\n"
@@ -113,35 +111,6 @@ def test_once_it_is_removed_no_run_and_no_job_is_deleted_until_its_folder_is_mov
             assert "deleted 2 jobs and 2 runs" in server.muster("gc", "--older-than", "0m").stdout
 
 
-def test_a_key_sees_the_notes_on_runs_that_it_may_see(installed: Path, tmp_path: Path) -> None:
-    keys, store = HomeKeys(tmp_path), Store(tmp_path / "store").open()
-    every, some = keys.create("every"), keys.create("some", ["shared"])
-    add_run(store, "hidden", queue="default")
-    add_run(store, "shown", queue="shared")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PYTHONPATH", str(installed))
-        with Serving(tmp_path, "--cpus", "1") as server:
-            of = {key.name: {"authorization": f"Bearer {key.access_key_id}:{key.secret}"} for key in (every, some)}
-            for run in ("hidden", "shown"):
-                sent = {"url": f"{server.url}/api/notes/{run}", "json": {"text": f"on {run}"}}
-                assert httpx.post(**sent, headers=of["every"]).status_code == 200
-                assert httpx.post(**sent, headers=of["some"]).status_code == {"hidden": 404, "shown": 200}[run]
-            found = {name: httpx.get(f"{server.url}/api/notes", headers=each).json() for name, each in of.items()}
-            assert [each["run"] for each in found["every"]] == ["hidden", "shown"]
-            assert found["some"] == [{"run": "shown", "notes": ["on shown", "on shown"]}]
-            page = httpx.get(f"{server.url}/notes", headers={**of["some"], "accept": "text/html"}).text
-            assert "on shown" in page and "on hidden" not in page
-
-
-@pytest.mark.parametrize("text", ["", "  "])
-def test_an_empty_note_is_one_error(server: Serving, text: str) -> None:
-    run = run_of(server)
-    done = run_muster("notes", run, text, home=server.home)
-    words = "muster: TEXT: the note is empty; write some words, or leave it out to print the notes\n"
-    assert (done.returncode, done.stdout, done.stderr) == (2, "", words)
-    assert httpx.post(f"{server.url}/api/notes/{run}", json={"text": text}).status_code == 400
-
-
 def test_its_task_and_its_part_of_a_bundle_are_found(installed: Path) -> None:
     code = """
 import json
@@ -169,62 +138,34 @@ def test_a_controller_that_started_before_the_plug_in_was_installed_is_to_be_sta
 
 
 COMMAND = "commands=(Command('tally', 'tally_parts', 'Runs', 'Count.'),)"
-SECTION = "JobSection('{}', 'counts', 'tally_parts:{}', 'tally_parts', 'tally_parts:RULES', 'tally_parts:Watcher')"
+OPTIONS = "options=(('evaluate', 'tally_parts:MORE'),)"
+SECTION = "sections=(JobSection('{}', 'counts', 'tally_parts:Tally', 'tally_parts', 'tally_parts:RULES', 'tally_parts:Watcher'),)"
 OTHER = "def register(app):\n    app.command('score')(print_it)\ndef print_it() -> None:\n    pass\n"
 UNREADABLE = "def register(app):\n    app.command('tally')(print_it)\ndef print_it(x: 'nowhere') -> None:\n    pass\n"
-BROKEN = {
-    "Command('list', 'tally_parts', 'Runs', 'Count.')": ("--help", "", "commands: muster list is Muster's own"),
-    COMMAND.replace("tally_parts", "nowhere"): ("tally", "", "commands: nowhere:register can't be imported (No module"),
-    f"{COMMAND} ": ("tally", "1 / 0", "commands: tally_parts:register can't be imported (division by zero)"),
-    f"{COMMAND}  ": ("tally", "", "commands: tally_parts:register can't be imported (module 'tally_parts' has no"),
-    f"{COMMAND}   ": ("tally", "register = 3", "commands: tally_parts:register is int, and no Callable"),
-    f"{COMMAND}    ": ("tally", OTHER, "commands: tally_parts failed (it registers score, and not tally)"),
-    f"{COMMAND}     ": ("tally --help", UNREADABLE, "commands: tally_parts failed (name 'nowhere' is not defined)"),
-    "options=(('evalute', 'tally_parts:MORE'),)": (
-        "--help",
-        "",
-        "options: unknown command evalute; did you mean e",
-    ),
-    "options=(('evaluate', 'tally_parts:MORE'),)": (
-        "evaluate --help",
-        "",
-        "options: tally_parts:MORE can't be imported",
-    ),
-    "options=(('evaluate', 'tally_parts:MORE'),) ": (
-        "evaluate --help",
-        "MORE = 3",
-        "options: tally_parts:MORE is int, and",
-    ),
-    "templates='nowhere'": ("serve", "", "templates: nowhere can't be imported (No module named 'nowhere')"),
-    "templates='tally'": ("serve", "", "templates: tally has no folder templates with files; install it"),
-    "routers=('tally_parts:router',)": ("serve", "", "routers: tally_parts:router can't be imported"),
-    "pages=('tally_parts:pages',)": (
-        "run JOB",
-        "1 / 0",
-        "pages: tally_parts:pages can't be imported (division by zero)",
-    ),
-    "forms=('tally_parts:FORM',)": ("serve", "FORM = 3", "forms: tally_parts:FORM is int, and no TaskForm"),
-    f"sections=({SECTION.format('tally', 'Tally')},)": ("serve", "", "sections: tally_parts:Tally can't be imported"),
-    f"sections=({SECTION.format('tally', 'Tally')},) ": (
-        "run JOB",
-        "class Tally: pass",
-        "sections: tally_parts:Tally failed",
-    ),
-    f"sections=({SECTION.format('queue', 'Tally')},)": (
-        "schema",
-        "from orchestrator.spec.sections import OfCheckpoint as Tally",
-        "sections: tally_parts:Tally failed (queue is a key of every job",
-    ),
-}
-"""Declarations (with spaces, to be told apart): a command that uses the part, the module of the parts, and the error."""
+QUEUE = "from orchestrator.spec.sections import OfCheckpoint as Tally"
+BROKEN = [
+    (COMMAND.replace("tally'", "list'"), "--help", "", "commands: muster list is Muster's own"),
+    (COMMAND.replace("_parts", "_gone"), "tally", "", "commands: tally_gone:register can't be imported (No module"),
+    (COMMAND, "tally", "1 / 0", "commands: tally_parts:register can't be imported (division by zero)"),
+    (COMMAND, "tally", "register = 3", "commands: tally_parts:register is int, and no Callable"),
+    (COMMAND, "tally", OTHER, "commands: tally_parts failed (it registers score, and not tally)"),
+    (COMMAND, "tally --help", UNREADABLE, "commands: tally_parts failed (name 'nowhere' is not defined)"),
+    (OPTIONS.replace("ate'", "te'"), "--help", "", "options: unknown command evalute; did you mean e"),
+    (OPTIONS, "evaluate --help", "", "options: tally_parts:MORE can't be imported"),
+    ("templates='nowhere'", "serve", "", "templates: nowhere can't be imported (No module named 'nowhere')"),
+    ("templates='tally'", "serve", "", "templates: tally has no folder templates with files; install it"),
+    ("routers=('tally_parts:router',)", "serve", "", "routers: tally_parts:router can't be imported"),
+    ("forms=('tally_parts:FORM',)", "serve", "FORM = 3", "forms: tally_parts:FORM is int, and no TaskForm"),
+    (SECTION.format("tally"), "run JOB", "class Tally: pass", "sections: tally_parts:Tally failed"),
+    (SECTION.format("queue"), "schema", QUEUE, "sections: tally_parts:Tally failed (queue is a key of every job"),
+]
+"""Declarations: a command that uses the part, the module of the parts, and the error."""
 
 
-@pytest.mark.parametrize("declaration", BROKEN)
+@pytest.mark.parametrize(("declaration", "command", "code", "words"), BROKEN)
 def test_a_part_that_can_t_be_used_ends_a_command_with_one_line_that_names_the_plug_in(
-    tmp_path: Path, declaration: str
+    tmp_path: Path, declaration: str, command: str, code: str, words: str
 ) -> None:
-    command, code, words = BROKEN[declaration]
-    declaration = f"commands=({declaration},)" if declaration.startswith("Command") else declaration
     write_package(tmp_path, "tally", f"Plugin({declaration})", code)
     (tmp_path / "job.yaml").write_text(JOB)
     arguments = command.replace("JOB", str(tmp_path / "job.yaml")).split()

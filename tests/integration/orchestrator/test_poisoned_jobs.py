@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -27,7 +26,6 @@ from orchestrator.domain.job import Status
 from orchestrator.domain.reasons import Reason
 from orchestrator.engines.api import (
     CannotStart,
-    EngineError,
     Gang,
     GangStatus,
     Handle,
@@ -138,18 +136,7 @@ def test_an_engine_that_wants_to_end_the_process_ends_neither_its_thread_nor_the
 
 
 HALF = "a name with half a character: \udcff"
-"""As the name of a file has it that is no UTF-8: no database can store it."""
-
-
-def test_a_reason_that_no_column_can_hold_is_written_out(bench: Bench) -> None:
-    bench.engine.raises["launch"] = EngineError(HALF)
-    bench.submit("bad")
-    bench.wait("bad", Status.FAILED)
-    with bench.database.session() as session:
-        reason = session.get_one(Job, "bad").reason
-    assert reason.words == "can't start the gang: a name with half a character: \\udcff"
-    assert reason.aws == "Task failed to start"
-    bench.runs_and_ends("good")
+"""As the name of a file has it that isn't UTF-8: no database can store it."""
 
 
 def test_a_container_that_the_engine_can_t_start_fails_each_attempt_and_rules_see_aws_s_reasons(bench: Bench) -> None:
@@ -251,8 +238,8 @@ def test_an_attempt_is_read_back_as_the_state_machine_left_it(tmp_path: Path, mo
         bench.explains("job", "no room yet")
         engine.error = None
         assert bench.wait("job", Status.RUNNING).status_reason == "attempt 1 runs on 2 nodes"
-        gangs["job/1/1"][0] = NodeStatus(NodePhase.UNREACHABLE, words="out of sight")
-        bench.explains("job", "out of sight")
+        gangs["job/1/1"][0] = NodeStatus(NodePhase.UNREACHABLE, words="unreachable now")
+        bench.explains("job", "unreachable now")
         engine.cluster.end("job/1/1", 1, 3)
         bench.explains("job", "attempt 2 runs on 2 nodes")
         with bench.database.session() as session:
@@ -276,7 +263,7 @@ def test_what_another_controller_changed_meanwhile_counts_once_the_database_is_b
     bench.controller._kept = 0.0
     with mock.patch.object(database, "keep_lock", side_effect=DatabaseError("another controller has it")):
         wait_for(lambda: bench.controller.trouble, 20, "that the lock is missed")
-        with database.engine.begin() as other:  # as the other controller does: this one is not told
+        with database.engine.begin() as other:  # as the other controller does: this one is not notified
             other.execute(update(Job).where(Job.id == "a").values(stop_reason="enough"))
             moment = {"stopped_at": 1, "ending": "stopped", "spent": True}
             other.execute(update(Attempt).where(Attempt.job_id == "b").values(**moment))
@@ -284,18 +271,3 @@ def test_what_another_controller_changed_meanwhile_counts_once_the_database_is_b
     assert bench.wait("a", Status.FAILED).status_reason == "enough"
     assert bench.job("b").status_reason == "ended there"
     wait_for(lambda: not bench.controller.bus.presence.expected(), 20, "that no gang is expected")
-
-
-def test_a_stop_does_not_wait_for_outcomes_that_can_not_be_read(bench: Bench) -> None:
-    bench.submit("a", node_properties=properties(1, 2, MUSTER_ON_CHILD_FAILURE="ignore"), kind="multinode")
-    bench.wait("a", Status.RUNNING)
-    runs, answered = bench.controller.attempts.runs, threading.Event()
-    outcomes = runs.outcomes
-    runs.outcomes = lambda *requested: (answered.wait(60), outcomes(*requested))[1]  # type: ignore[method-assign]
-    bench.engine.cluster.end("a/1/1", 1, 0)
-    with bench.database.session() as session:
-        session.get_one(Job, "a").stop_reason = "enough"
-    wait_for(lambda: not any(node.running for node in bench.engine.cluster.gangs["a/1/1"]), 30, "the stop")
-    assert bench.job("a").status == Status.RUNNING, "how it ended is not known yet"
-    answered.set()
-    assert bench.wait("a", Status.FAILED).status_reason == "enough"

@@ -1,4 +1,4 @@
-"""Logs that real nodes push to those who follow them; with and without a bus, and while messages are lost."""
+"""Logs that real nodes push to those who follow them."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ import httpx
 import pytest
 
 from orchestrator.client import Client
-from orchestrator.control import bus as bus_module
 from orchestrator.control import log_tail
 from orchestrator.server import Server
-from shared_store.contract.bus import Node
 from shared_store.volume import log_files
 from tests.conftest import submit_gang, wait_for
 
@@ -73,9 +71,7 @@ class Talk:
 
 
 @pytest.fixture
-def talk(tmp_path: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Talk]:
-    if getattr(request, "param", None) == "no bus":
-        monkeypatch.setenv("MUSTER_BUS_OFF", "1")
+def talk(tmp_path: Path) -> Iterator[Talk]:
     server = Server(tmp_path / "home", cpus=2)
     server.start()
     talk = Talk(server, tmp_path / "talk")
@@ -104,44 +100,3 @@ def test_lines_come_by_push_alone_while_the_bus_delivers(talk: Talk, monkeypatch
         thread.join(120)
     assert all(map(talk.has_all, everyone)) and not talk.server.controller.logs._followed
     assert all(texts[-1].startswith("node ") for texts in everyone), "the last lines are the supervisors'"
-
-
-@pytest.mark.parametrize("talk", ["no bus"], indirect=True)
-def test_without_a_bus_lines_come_from_the_files(talk: Talk) -> None:
-    everyone = [talk.follow() for _ in range(5)]
-    for number in range(5):
-        talk.say(f"line {number}")
-        wait_for(lambda: all(map(talk.has_all, everyone)))
-    talk.say("end")
-    for thread in talk.threads:
-        thread.join(120)
-        assert not thread.is_alive()
-    assert all(map(talk.has_all, everyone))
-
-
-def test_a_bus_that_loses_doubles_and_holds_back_pushes_loses_no_line(
-    talk: Talk, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bus = talk.server.bus
-    assert isinstance(bus, bus_module.Bus)
-    genuine, count, held = bus.pushed, 0, list[tuple[Node, int, bytes]]()
-
-    def bad(node: Node, position: int, data: bytes) -> None:
-        nonlocal count
-        count += 1
-        if count % 4 == 0:
-            held.append((node, position, data))
-        elif count % 4 != 1:
-            genuine(node, position, data)
-            genuine(node, position, data)
-            while held:
-                genuine(*held.pop())
-
-    bus.pushed = bad
-    texts = talk.follow()
-    for number in range(60):
-        talk.say(f"line {number}")
-        wait_for(lambda number=number: texts.count(f"0:line {number}") + texts.count(f"1:line {number}") == 2)
-    talk.say("end")
-    talk.threads[0].join(120)
-    assert talk.has_all(texts) and count > 20

@@ -108,25 +108,14 @@ def test_a_run_of_an_unfinished_job_is_neither_archived_nor_deleted(server: Serv
 
 
 def test_rules_are_checked_where_they_are_set(server: Serving) -> None:
-    refused(
-        ["serve", "--port", "0", "--retention", "soon"],
-        server.home,
-        2,
-        "--retention: 'soon': expected days, hours or minutes, such as 90d",
-    )
-    refused(["serve", "--port", "0", "--retention", "0d"], server.home, 2, "every job would be deleted as it ends")
-    refused(
-        ["gc", "--older-than", "x"],
-        server.home,
-        2,
-        "older_than: 'x': expected days, hours or minutes, such as 90d, 36h or 45m",
-    )
-    refused(
-        ["gc", "--older-than", "off"],
-        server.home,
-        2,
-        "older_than: 'off': expected days, hours or minutes, such as 90d, 36h or 45m",
-    )
+    expected = "expected days, hours or minutes, such as 90d"
+    for line, words in (
+        ("serve --port 0 --retention soon", f"--retention: 'soon': {expected}"),
+        ("serve --port 0 --retention 0d", "every job would be deleted as it ends"),
+        ("gc --older-than x", f"older_than: 'x': {expected}, 36h or 45m"),
+        ("gc --older-than off", f"older_than: 'off': {expected}, 36h or 45m"),
+    ):
+        refused(line.split(), server.home, 2, words)
     with pytest.raises(ApiError, match="is not a place in the list of jobs"):
         server.client.get("/api/gc", after="nowhere")
     queue = "arn:aws:batch:us-east-1:000000000000:job-queue/default"
@@ -249,29 +238,20 @@ def test_an_evaluation_that_waits_keeps_its_run(inside: Server, http: httpx.Clie
             http.post("/v1/terminatejob", json={"jobId": job, "reason": "enough"})
 
 
-def test_a_run_that_is_cloned_is_not_deleted_meanwhile_and_never_again(
-    inside: Server, http: httpx.Client, trained: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("path", "body", "why"),
+    [("clone", {"name": "twin"}, "run twin is a clone of it"), ("resume", {}, "job {job} has not ended")],
+)
+def test_a_run_that_is_cloned_or_resumed_is_not_deleted_meanwhile_nor_afterwards(
+    inside: Server, http: httpx.Client, trained: str, monkeypatch: pytest.MonkeyPatch, path: str, body: Any, why: str
 ) -> None:
     with monkeypatch.context() as patch:
         outcome = delete_during(inside, patch, trained)
-        answer = http.post(f"/api/runs/{trained}/clone", json={"name": f"clone-{trained}"})
-    assert answer.status_code == 200, answer.text
-    assert outcome == [f"run {trained} is used by another request now; try again in a moment"]
-    with pytest.raises(RunNeeded, match=f"run clone-{trained} is a clone of it"):
-        inside.controller.retention.delete(trained)
-    http.post("/v1/terminatejob", json={"jobId": answer.json()["jobId"], "reason": "enough"})
-
-
-def test_a_run_that_is_resumed_is_not_deleted_meanwhile(
-    inside: Server, http: httpx.Client, trained: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        outcome = delete_during(inside, patch, trained)
-        answer = http.post(f"/api/runs/{trained}/resume", json={})
+        answer = http.post(f"/api/runs/{trained}/{path}", json=body)
     assert answer.status_code == 200, answer.text
     assert outcome == [f"run {trained} is used by another request now; try again in a moment"]
     job = answer.json()["jobId"]
-    with pytest.raises(RunNeeded, match=f"job {job} has not ended"):
+    with pytest.raises(RunNeeded, match=why.format(job=job)):
         inside.controller.retention.delete(trained)
     http.post("/v1/terminatejob", json={"jobId": job, "reason": "enough"})
 
@@ -288,17 +268,6 @@ def test_while_a_run_is_deleted_requests_about_it_are_refused(inside: Server, ht
         job = {"jobName": "x", "jobQueue": "default", "jobDefinition": "continues"}
         assert http.post("/v1/submitjob", json=job).status_code == 409
     assert http.get(f"/api/runs/{trained}").status_code == 200
-
-
-def test_archiving_a_run_reads_that_run_alone(
-    inside: Server, http: httpx.Client, trained: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def scan(_fresh: float) -> None:
-        raise AssertionError("what needs runs is looked for in the whole store")
-
-    monkeypatch.setattr(inside.controller.retention.stored, "references", scan)
-    assert http.post(f"/api/runs/{trained}/archive", json={}).json() == {"run": trained, "archived": True}
-    http.post(f"/api/runs/{trained}/archive", json={"archived": False}).raise_for_status()
 
 
 def test_a_volume_that_fails_is_answered_in_one_line(

@@ -32,7 +32,7 @@ OVERSIZED = {
     f"is larger than {2**63 - 1}": ("createjobqueue", '{"priority": -9223372036854775809}'),
     "a number of the request is too large": ("createschedulingpolicy", '{"name": "a", "fairsharePolicy": 1e999}'),
 }
-"""Operation and body by what is said of them."""
+"""Operation and body, by the words of the refusal."""
 LARGE = [{"name": f"A{number}", "value": "x" * 200} for number in range(90)]
 
 

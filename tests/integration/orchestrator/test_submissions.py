@@ -35,7 +35,7 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
 
 
 def sent(server: Server, path: str, body: dict[str, Any] | str, key: str | None = None) -> httpx.Response:
-    """The answer to a request; a body that is a text is sent as it is."""
+    """The answer to a request; a body of text is sent as it is."""
     text = body if isinstance(body, str) else json.dumps(body)  # half of a character is sent as \\ud800
     headers = {"content-type": "application/json", **({"x-muster-idempotency-key": key} if key else {})}
     return httpx.post(f"{server.url}{path}", content=text, headers=headers, timeout=60)
@@ -62,12 +62,12 @@ ENVIRONMENTS: dict[str, tuple[dict[str, str], str]] = {
     "a spec with half of a character": ({"MUSTER_SPEC": '{"name": "\\ud800"}'}, "MUSTER_SPEC, .* is malformed"),
     "a spec of 900 levels": ({"MUSTER_SPEC": DEEP}, "MUSTER_SPEC, .* is malformed"),
     "a spec of 9,000 levels": ({"MUSTER_SPEC": "[" * 9000 + "]" * 9000}, "MUSTER_SPEC, .* is malformed"),
-    "a limit of the log that is no number": ({"MUSTER_LOG_LIMIT": "x"}, "MUSTER_LOG_LIMIT .* is malformed"),
+    "a limit of the log of letters": ({"MUSTER_LOG_LIMIT": "x"}, "MUSTER_LOG_LIMIT .* is malformed"),
     "a negative limit of the log": ({"MUSTER_LOG_LIMIT": "-5"}, "MUSTER_LOG_LIMIT .* is malformed"),
     "a time that is none": ({"MUSTER_STALL_TIMEOUT": "soon"}, "MUSTER_STALL_TIMEOUT, .* is malformed"),
     "a time without an end": ({"MUSTER_STALL_TIMEOUT": "nan"}, "MUSTER_STALL_TIMEOUT, .* is malformed"),
     "no ranks": ({"MUSTER_RANKS_PER_NODE": "0"}, "MUSTER_RANKS_PER_NODE .* is malformed"),
-    "nodes that are no number": ({"MUSTER_MIN_NODES": "few"}, "MUSTER_MIN_NODES is 'few'; expected an integer"),
+    "nodes in words": ({"MUSTER_MIN_NODES": "few"}, "MUSTER_MIN_NODES is 'few'; expected an integer"),
     "an unknown policy": ({"MUSTER_ON_CHILD_FAILURE": "garbage"}, "MUSTER_ON_CHILD_FAILURE: expected restart, fail or"),
     "no policy": ({"MUSTER_ON_CHILD_FAILURE": ""}, "MUSTER_ON_CHILD_FAILURE: expected restart, fail or"),
     "a run that can't be named so": ({"MUSTER_RUN": "../x"}, r"MUSTER_RUN '../x': a run is named with"),
@@ -170,7 +170,7 @@ def test_a_job_that_continues_a_run_is_checked_by_the_same_rules(
 @pytest.mark.parametrize(
     "spec", [r'{"name": "\ud800"}', DEEP, "{not json", "[1]"], ids=["half", "deep", "text", "list"]
 )
-def test_a_row_that_an_earlier_muster_has_stored_is_named_and_is_no_internal_error(server: Server, spec: str) -> None:
+def test_a_row_that_an_earlier_muster_has_stored_is_named_without_an_internal_error(server: Server, spec: str) -> None:
     job = sent(server, "/api/jobs", {"spec": SPEC}).json()["jobId"]
     stored = multinode("say", container(["true"], env={"MUSTER_SPEC": spec}))["nodeProperties"]
     with server.controller.database.session() as session:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import re
 import shutil
@@ -11,8 +10,6 @@ import signal
 import socket
 import sqlite3
 import threading
-import time
-from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,17 +20,11 @@ import pytest
 from orchestrator.client import Client
 from orchestrator.control import disk
 from orchestrator.domain.errors import ApiError, ServerError
-from orchestrator.engines.api import Handle
 from orchestrator.engines.local.engine import LocalEngine
-from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.home import HomeLock
-from orchestrator.persistence.batch_models import Job
-from orchestrator.persistence.session import Database, DatabaseError
 from orchestrator.server import Server
-from shared_store.volume import epoch, files
 from tests.conftest import submit_gang, wait_for
 from tests.support.orchestrator.jobs import FOREVER, await_status, detail, serving
-from tests.support.orchestrator.rows import job
 from tests.support.processes import end_all, processes_of, processes_of_job
 
 
@@ -210,16 +201,6 @@ def test_gangs_of_a_deleted_database_are_named_at_the_next_start(home: Path, cap
     assert sum("has no such job" in record.getMessage() for record in caplog.records) == 1
 
 
-def test_a_commit_to_a_deleted_database_file_is_not_acknowledged(tmp_path: Path) -> None:
-    database = Database.at(tmp_path)
-    with pytest.raises(DatabaseError, match="was deleted while the controller runs"), database.session() as session:
-        session.add(job("lost"))
-        (tmp_path / "muster.db").unlink()
-    with pytest.raises(DatabaseError, match="was deleted"), database.session() as session:
-        session.get(Job, "lost")
-    database.close()
-
-
 def test_a_server_that_can_t_be_made_leaves_nothing_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     closed: list[str] = []
     close = LocalEngine.close
@@ -248,34 +229,6 @@ def test_a_server_that_can_t_be_made_leaves_nothing_open(tmp_path: Path, monkeyp
     assert closed == ["local"] * 3
 
 
-def test_the_ray_engine_names_its_machines_while_gangs_are_stopped(tmp_path: Path) -> None:
-    engine = RayEngine.__new__(RayEngine)  # no cluster is needed for what gangs hold
-    engine.home, engine._lock, engine._grown, engine._tries = tmp_path, threading.Lock(), {}, {}
-    stop = threading.Event()
-    handles = (Handle("ray", f"job{number}/1/1", 1, {"hosts": ["ray/+1"]}) for number in itertools.count(1))
-    stopped: list[Handle] = []
-
-    def hold_and_stop() -> None:
-        held: deque[Handle] = deque()
-        while not stop.is_set():
-            held.append(next(handles))
-            engine._note(held[-1])
-            if len(held) > 20:
-                engine.stop(held[0], 0)
-                stopped.append(held.popleft())
-
-    thread = threading.Thread(target=hold_and_stop)
-    thread.start()
-    try:
-        deadline = time.monotonic() + 1
-        while time.monotonic() < deadline:
-            assert engine._taken() == {}
-    finally:
-        stop.set()
-        thread.join()
-    assert stopped, "while the machines were looked at"
-
-
 def test_a_hanging_volume_is_named_and_delays_no_request(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     look, answers = os.statvfs, threading.Event()
 
@@ -296,37 +249,5 @@ def test_a_hanging_volume_is_named_and_delays_no_request(inside: Server, monkeyp
             wait_for(lambda: missing in detail(client, waiting)["statusReason"], 30, "the reason why it waits")
             answers.set()
             await_status(client, waiting, "SUCCEEDED")
-    finally:
-        answers.set()
-
-
-def test_a_claim_that_lands_late_fences_off_no_later_gang_and_is_released(
-    inside: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    publish, hangs, answers = files.write_atomic, threading.Event(), threading.Event()
-
-    def hanging(path: Path, data: bytes) -> None:
-        if path.name == "EPOCH" and not hangs.is_set():
-            hangs.set()
-            answers.wait()
-        publish(path, data)
-
-    monkeypatch.setattr(epoch, "write_atomic", hanging)
-    run, env = inside.store.run("shared"), {"MUSTER_RUN": "shared"}
-    try:
-        with Client(inside.url) as client:
-            first = submit_gang(client, "pass", env=env)
-            assert hangs.wait(30)
-            client.batch("TerminateJob", jobId=first, reason="enough")
-            await_status(client, first, "FAILED")
-            second = submit_gang(client, FOREVER, env=env)
-            why = f"store {inside.store.path}: can't read run shared now (it has not answered the attempt before yet); trying again"
-            wait_for(lambda: detail(client, second)["statusReason"] == why, 10, "the reason why it waits")
-            answers.set()
-            await_status(client, second, "RUNNING")
-            assert epoch.read_epoch(run) == 2 and epoch.read_claim(run, 2) is not None
-            wait_for(lambda: epoch.read_claim(run, 1) is None, 10, "that the first claim is released")
-            client.batch("TerminateJob", jobId=second, reason="enough")
-            await_status(client, second, "FAILED")
     finally:
         answers.set()

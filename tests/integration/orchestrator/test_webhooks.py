@@ -45,7 +45,7 @@ def receiver(listening: Receiver) -> Receiver:
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory: pytest.TempPathFactory, listening: Receiver) -> Iterator[Serving]:
     """A controller that tells the receiver of every end."""
-    home = tmp_path_factory.mktemp("told")
+    home = tmp_path_factory.mktemp("reported")
     file = write_webhooks(home / "hooks.json", chat={"url": listening.url, "link": "https://muster.example/"})
     with Serving(home / "home", "--cpus", "2", "--webhooks", file) as server:
         yield server
@@ -60,7 +60,7 @@ def is_signed(headers: dict[str, str], body: bytes) -> bool:
     return headers["webhook-signature"] == f"v1,{expected}"
 
 
-def test_the_receiver_is_told_of_each_end_once_and_the_message_is_signed(reported: Serving, receiver: Receiver) -> None:
+def test_the_receiver_learns_of_each_end_once_and_the_message_is_signed(reported: Serving, receiver: Receiver) -> None:
     good, bad = reported.gang("print(1)", name="good"), reported.gang("raise SystemExit(3)", name="bad")
     stopped = reported.gang("import time; time.sleep(3600)", name="stopped")
     reported.wait(stopped, "RUNNING")

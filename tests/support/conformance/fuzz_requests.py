@@ -63,7 +63,7 @@ KNOWN = {
     "value": ("2", "nan", '{"name": "\\ud800"}', '{"name": NaN}', "[]", "null", '"x"', "1e400", "restart"),
 }
 ARRAYS = (2, 3, 1, 0, -1, 10_001)
-"""An array of 10,000 is no fault, but takes its time."""
+"""An array of 10,000 is valid, but takes its time."""
 
 
 def _container(**changes: Any) -> dict[str, Any]:

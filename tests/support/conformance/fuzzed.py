@@ -111,10 +111,10 @@ class Fuzzed(Serving):
 
     def complaints(self) -> str:
         """What the server wrote to its standard error since the last call."""
-        with open(str(self.errors)) as errors:
+        with open(str(self.errors), encoding="latin-1", newline="") as errors:  # a character a byte
             errors.seek(self.offset)
             output = errors.read()
-            self.offset = errors.tell()
+        self.offset += len(output)
         return output
 
     def close(self) -> None:

@@ -56,7 +56,7 @@ Class = Callable[[Target, int, random.Random, Callable[[], None]], int]
 
 
 def _silent(data: Callable[[Target, random.Random], bytes]) -> Class:
-    """Connections that send this and fall silent: the server waits for more, or for somebody to read its answers."""
+    """Connections that send this and fall silent: the server waits for more, or for a reader of its answers."""
 
     def send(target: Target, count: int, rng: random.Random, meanwhile: Callable[[], None]) -> int:
         with connections(target, count) as opened:

@@ -38,7 +38,7 @@ OWN_MADE = "+ + + + - - -"
 
 
 class World:
-    """A server with a queue ``robots``, whose key made all that there is in it, and a queue ``lab``."""
+    """A server with a queue ``robots``, whose key made everything in it, and a queue ``lab``."""
 
     def __init__(self, home: Path) -> None:
         kept = {"robots": ("robots",), "robots-reader": ("robots",), "lab": ("lab",), "lab-reader": ("lab",)}

@@ -91,7 +91,7 @@ class Person:
 
 
 class People:
-    """Who is at the browser; in the end none of them may have seen a page that complains or asks somebody else."""
+    """Who is at the browser; in the end none of them may have seen a page that complains or sends a request elsewhere."""
 
     def __init__(self, browser: Browser) -> None:
         self._browser, self._all = browser, list[Person]()

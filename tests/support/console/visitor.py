@@ -82,7 +82,7 @@ class Visitor:
         return self.http.post(path, data=data, headers={"Accept": "application/json"})
 
     def refusal(self, path: str, status: int = 403, **fields: Any) -> str:
-        """What the person is told whose form is refused with this status."""
+        """The message to a person whose form is refused with this status."""
         answer = self.submit(path, **fields)
         assert answer.status_code == status, answer.text
         return str(answer.json()["message"])

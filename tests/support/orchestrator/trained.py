@@ -20,7 +20,7 @@ SETTINGS = {"hidden_sizes": [8], "optimizer": "adam", "activation": "elu", "lear
 def add_run(store: Store, name: str, spec: dict[str, Any] | None = SPEC, queue: str = "default") -> None:
     """Run ``name``, without a checkpoint."""
     path = store.run(name).path
-    write_json(path / "run.json", {"run": name, "created": 1, "spec": spec, "queue": queue, "owner": "somebody"})
+    write_json(path / "run.json", {"run": name, "created": 1, "spec": spec, "queue": queue, "owner": "ann"})
 
 
 def add_checkpoint(store: Store, name: str, iteration: int, weights: bytes = b"weights", **facts: Any) -> Checkpoint:

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
-import subprocess
-import sys
 import threading
 from concurrent.futures import wait
 
@@ -47,35 +44,3 @@ def test_a_thread_that_works_does_not_end_and_no_call_is_lost_beside_threads_tha
     wait_for(lambda: threads("a busy pool") == 0, 10, "that the threads end")
     assert pool.busy_since is None
     pool.close(1.0)
-
-
-_ARENAS = """
-import ctypes, sys, tempfile, threading
-from orchestrator import machine
-if sys.argv[1:] == ["shared"]:
-    machine.share_arenas()
-libc, barrier = ctypes.CDLL(None), threading.Barrier(9)
-libc.malloc.restype = libc.fopen.restype = ctypes.c_void_p
-def allocate():
-    libc.malloc(100_000)
-    barrier.wait()
-for _ in range(8):
-    threading.Thread(target=allocate).start()
-barrier.wait()
-with tempfile.NamedTemporaryFile() as found:
-    file = ctypes.c_void_p(libc.fopen(found.name.encode(), b"w"))
-    libc.malloc_info(0, file)
-    libc.fclose(file)
-    print(found.read().count(b"<heap"))
-"""
-
-
-def arenas(*arguments: str) -> int:
-    done = subprocess.run([sys.executable, "-c", _ARENAS, *arguments], capture_output=True, text=True, check=True)
-    return int(done.stdout)
-
-
-@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "malloc_info"), reason="glibc alone has arenas")
-def test_the_threads_of_a_controller_share_two_arenas() -> None:
-    assert arenas() > 2
-    assert arenas("shared") == 2

@@ -16,7 +16,7 @@ from orchestrator.api.logs.filter import parse
 from orchestrator.api.logs.log_events import LogFile, LogSnapshot
 from shared_store.volume.logs import format_line
 
-LINES = ["ERROR 404 in trainer", "ERROR in loader", "WARN: loss is nan", "iteration 12/300", 'said "hi" at 50%', "",
+LINES = ["ERROR 404 in trainer", "ERROR in loader", "WARN: loss is nan", "iteration 12/300", 'says "hi" at 50%', "",
          "Fehler: größer"]  # fmt: skip
 
 
@@ -69,7 +69,7 @@ UNREADABLE = {
 
 
 @pytest.mark.parametrize("regex", UNREADABLE)
-def test_a_regex_that_can_not_be_read_is_refused_with_the_reason(regex: str) -> None:
+def test_a_regex_that_cannot_be_read_is_refused_with_the_reason(regex: str) -> None:
     with pytest.raises(ValueError, match=re.escape(UNREADABLE[regex])) as refused:
         parse(f"%{regex}%")
     assert "\n" not in str(refused.value)

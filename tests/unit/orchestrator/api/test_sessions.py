@@ -35,7 +35,7 @@ def test_a_session_has_the_rights_of_its_key_as_they_are_now(keys: KeyStore) -> 
     assert here.session(session) is None, "another key of the same name"
 
 
-def test_work_for_somebody_has_the_rights_that_they_have_now(keys: KeyStore) -> None:
+def test_work_for_another_has_the_rights_that_they_have_now(keys: KeyStore) -> None:
     """Automatic evaluations ask so: whoever would not be admitted has no rights."""
     names = ("MUSTER_TOKEN", "user ann", "address 10.0.0.1", "this process", "key a")
     here, with_token = Access(keys), Access(keys, "a-token-of-the-server")

@@ -76,7 +76,7 @@ def policy(path: Path, matrix: list[list[float]], note: str = "") -> Path:
     return path
 
 
-def test_the_greatest_difference_of_parameters_is_told_and_notes_are_none(tmp_path: Path) -> None:
+def test_the_greatest_difference_of_parameters_is_shown_and_notes_are_none(tmp_path: Path) -> None:
     one = policy(tmp_path / "one", [[1.0, 2.0], [3.0, 4.0]])
     other = policy(tmp_path / "other", [[1.0, 2.25], [2.5, 4.0]])
     assert difference(one, other) == "differ: 6 parameters, by 0.5 at most"

@@ -16,8 +16,7 @@ def test_a_job_beside_a_run_does_not_name_the_runs_share(monkeypatch: pytest.Mon
     answer: dict[str, Any] = {"run": "taught", "spec": TRAINED}
     monkeypatch.setattr(Client, "get", lambda self, path, **query: answer)
     with Client("http://127.0.0.1:1") as client:
-        request = evaluations.EvaluationRequest("taught", {})
-        spec = evaluations._spec(client, "taught", request, {"episodes": 1}, [])
+        spec = evaluations._spec(client, "taught", "evaluate", None, {"episodes": 1}, [])
         assert (spec.queue, spec.share) == ("fair", None)
         recorded = recordings._common(answer, "record")
         assert recorded["queue"] == "fair" and "share" not in recorded

@@ -58,15 +58,6 @@ def test_plain_lines_have_each_phase_once_before_the_first_iteration_and_after_t
     assert printed[2:] == [*PHASES.values(), *AT_THE_END]
 
 
-def test_no_time_is_left_after_the_last_iteration(capsys: pytest.CaptureFixture[str]) -> None:
-    with _Lines(DETAIL) as lines:
-        lines.show(running("training"), RECORD)
-        lines.show(running("evaluating"), LAST)
-    printed = capsys.readouterr().out
-    assert "iteration 3/9  reward 1.00" in printed and "ETA" in printed.partition("iteration 9/9")[0]
-    assert "ETA" not in printed.partition("iteration 9/9")[2]
-
-
 def test_the_bar_shows_the_phase_and_for_how_long_unless_iterations_come(monkeypatch: pytest.MonkeyPatch) -> None:
     bar, now = _Bar(DETAIL), [0.0]
     monkeypatch.setattr("time.monotonic", lambda: now[0])

@@ -20,7 +20,7 @@ def training(done: int, saved: int, seconds: float = 1.0, **facts: Any) -> dict[
     return {**reported, **facts}
 
 
-def test_iterations_that_no_checkpoint_has_are_lost_and_a_long_one_is_told_before_it_is_left() -> None:
+def test_iterations_that_no_checkpoint_has_are_lost_and_a_long_one_is_reported_before_it_is_left() -> None:
     assert lost_iterations(training(7, 7)) == lost_iterations(training(0, 0)) == ""
     assert lost_iterations(training(8, 7)) == "lost: 1 iteration, those after 7 until 8"
     assert lost_iterations(training(3, 0)) == "lost: 3 iterations, those after 0 until 3"

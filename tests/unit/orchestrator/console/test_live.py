@@ -16,7 +16,7 @@ from fastapi import Request
 from orchestrator.api.http.access import Access
 from orchestrator.console import curves, live
 from orchestrator.console.curves import NewIterations
-from orchestrator.console.live import LiveParts, Recent, ServerSentEvent, Table, stream
+from orchestrator.console.live import Recent, ServerSentEvent, stream
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run, Store
@@ -42,31 +42,6 @@ def written(looks: Sequence[Callable[[], Sequence[ServerSentEvent] | None]]) -> 
     return asyncio.run(read()).split("\n\n")[:-1]
 
 
-def test_of_the_parts_of_a_page_only_what_changed_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
-    macros = SimpleNamespace(
-        jobs=lambda row: f"<tr>{row}</tr>", tabs=lambda found: f"{found % 10} <time data-since>{found}</time>"
-    )
-    template = SimpleNamespace(make_module=lambda values: macros)
-    monkeypatch.setattr(live, "shared", lambda request: {})
-    monkeypatch.setattr(live, "templates", SimpleNamespace(get_template=lambda name: template))
-    parts = LiveParts(request_of(), "jobs_live.html")
-
-    def sent(found: int, **rows: int) -> Any:
-        return [event.data for event in parts.changes({"jobs": Table(rows), "tabs": found})]
-
-    rows = {"a": "<tr>1</tr>", "b": "<tr>2</tr>"}
-    assert sent(3, a=1, b=2) == [{"jobs": {"order": ["a", "b"], "rows": rows}, "tabs": "3 <time data-since></time>"}]
-    assert sent(3, a=1, b=2) == []
-    assert sent(13, a=1, b=2) == [], "how long something is past is written by the page"
-    assert sent(4, b=3, a=1) == [
-        {"jobs": {"order": ["b", "a"], "rows": {"b": "<tr>3</tr>"}}, "tabs": "4 <time data-since></time>"}
-    ]
-    assert sent(4, b=3) == [{"jobs": {"order": ["b"], "rows": {}}}]
-    assert sent(4, b=3, a=1) == [{"jobs": {"order": ["b", "a"], "rows": {"a": "<tr>1</tr>"}}}], (
-        "the page has dropped it"
-    )
-
-
 def test_no_text_can_end_an_event_or_begin_another() -> None:
     event = ServerSentEvent("rows", {"x": "a\n\ndata: b\r\nevent: c\u2028\x00"}, "7")
     (_, block) = written([lambda: [event], lambda: None])[:2]
@@ -75,7 +50,7 @@ def test_no_text_can_end_an_event_or_begin_another() -> None:
     assert json.loads(lines[1].removeprefix("data: ")) == event.data
 
 
-def test_a_look_that_fails_is_told_and_the_stream_goes_on_to_its_end() -> None:
+def test_a_look_that_fails_is_reported_and_the_stream_goes_on_to_its_end() -> None:
     def failing() -> Sequence[ServerSentEvent]:
         raise ClientError("the run is gone")
 
