@@ -45,7 +45,7 @@ PHRASES = {
     r"\bof one's own\b": "your own, custom",
     r"(?<!there )\b(?:is|are|was|were) no (?!longer\b|more\b|way\b|better\b|worse\b|sooner\b|earlier\b|later\b|greater\b|smaller\b|part\b)[a-z]": "is not a, are not",
     r"\bsigns? of life\b": "heartbeat",
-    r"\bcan not\b": "can't, cannot",
+    r"\bcan not\b(?! run Jobs)": "can't, cannot",
     r"\bthat there (?:is|are|was|were)\b": "available, existing",
     r"\bwhat there (?:is|are|was|were)\b": "what exists",
     r"\bout of sight\b": "no permission to see",

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-SPEC = "name: said\nresources: {cpus: 1, memory: 256MiB}\ncommand: [sh, -c, 'echo a line of the job; exit 3']\n"
+SPEC = "name: resumed\nresources: {cpus: 1, memory: 256MiB}\ncommand: [sh, -c, 'echo a line of the job; exit 3']\n"
 
 
 def test_standard_output_is_json_alone_without_a_controller(tmp_path: Path) -> None:

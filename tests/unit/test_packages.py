@@ -210,7 +210,7 @@ def test_the_racer_in_the_controller_imports_neither_torch_nor_numpy() -> None:
     assert "racer.store.leagues" in loaded and not {*HEAVY, "numpy"} & set(loaded)
 
 
-def test_nothing_stands_at_the_root_of_a_package_that_is_no_entry() -> None:
+def test_only_entries_stand_at_the_root_of_a_package() -> None:
     modules = {path.stem for path in (REPOSITORY / "worker").glob("*.py")} - {"__init__"}
     assert modules == ENTRIES_OF_WORKER
     assert {path.stem for path in (REPOSITORY / "shared_store").glob("*.py")} == {"__init__"}

@@ -143,7 +143,9 @@ def _silence(world: Simulation, rng: Random, how: str) -> None:
     seconds = _seconds(rng)
     world.note(f"{node} is {how} for {seconds:.0f} s")
     setattr(node, how, True)
-    is_alone = world.bus_down and world.received <= 1  # then the router has not heard it for as long as the bus is down
+    is_alone = (
+        world.bus_down and world.received <= 1
+    )  # then the router has received nothing from it for as long as the bus is down
     node.silent_since = world.bus_down_since if is_alone else world.machine.time
     world.notice(node, _LEASE)
 

@@ -76,7 +76,7 @@ class Invariants:
         if self._world.bus_down and self._world.received <= 1:
             silences.append(
                 moment - self._world.bus_down_since
-            )  # it can't be told who is cut off: the node or the router
+            )  # nobody knows which is cut off: the node or the router
         if any(seconds > LOST_AFTER - _SLACK for seconds in silences):
             return
         ending, reason = self._attempt(gang.job, gang.attempt)

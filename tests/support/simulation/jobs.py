@@ -17,7 +17,7 @@ SUBMITTING = 1200.0
 
 @dataclass
 class SimulatedJob:
-    """What a user wants, has been told, and has."""
+    """What a user wants, knows and has."""
 
     name: str
     id: str

@@ -135,7 +135,7 @@ def test_a_function_that_fails_on_a_sample_is_refused_with_the_sample_and_the_li
         ("np.ones(1)", "it returned an array of shape (1,); return one number"),
     ],
 )
-def test_a_value_of_numpy_that_is_no_number_is_no_reward(value: str, message: str) -> None:
+def test_a_value_of_numpy_that_is_not_a_number_is_not_a_reward(value: str, message: str) -> None:
     assert output(f"import numpy as np\n{HEAD}return {value}") == f"r.py:2: TEST_FAILURE: the sample 'start': {message}"
     assert output(f"import numpy as np\n{HEAD}return np.array(1.5) + np.int64(2) * np.uint8(1)") == ""
 
@@ -162,7 +162,7 @@ def test_of_two_definitions_the_last_counts_and_underscores_of_own_objects_are_t
 
 
 @pytest.mark.parametrize("config", ["[1]", "{", "3", "null"])
-def test_a_configuration_of_the_check_that_is_no_mapping_is_refused_in_one_line(
+def test_a_configuration_of_the_check_that_is_not_a_mapping_is_refused_in_one_line(
     config: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["rewards", str(tmp_path / "r.py"), "--config", config])

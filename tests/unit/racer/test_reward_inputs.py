@@ -1,4 +1,4 @@
-"""A learner's reward function: what it is told, what the car earns, what happens where it fails or misbehaves."""
+"""A learner's reward function: its inputs, what the car earns, what happens where it fails or misbehaves."""
 
 from __future__ import annotations
 

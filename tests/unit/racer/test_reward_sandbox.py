@@ -318,7 +318,7 @@ assert shapely.ops.unary_union([shapely.geometry.box(0, 0, 1, 1), shapely.geomet
     assert runs(body) == ""
 
 
-def test_a_package_that_is_not_one_of_the_five_is_not_there_and_of_those_the_way_to_get_them_is_told() -> None:
+def test_a_package_that_is_not_one_of_the_five_is_missing_and_of_those_the_message_says_how_to_get_them() -> None:
     assert tried("import torch").endswith("the sample 'start': torch is not installed here")
     missing = ModuleNotFoundError("No module named 'shapely'", name="shapely")
     assert (
