@@ -102,4 +102,4 @@ def test_a_controller_that_is_not_alive_sends_no_heartbeat(tmp_path: Path) -> No
 def test_the_watchdog_of_another_process_is_not_ours() -> None:
     supplied = {"NOTIFY_SOCKET": "@nobody", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}
     assert ServiceManager(supplied).interval is None and supplied == {}
-    ServiceManager({"NOTIFY_SOCKET": "@nobody"}).report("READY=1")  # a manager that is gone is ignored
+    ServiceManager({"NOTIFY_SOCKET": "@nobody"}).notify("READY=1")  # a manager that is gone is ignored
