@@ -29,8 +29,8 @@ import mujoco
 import newton
 import numpy as np
 import warp as wp
-from newton.solvers import SolverMuJoCo
 
+from worker.simulation.robot_elements import empty_builder
 from worker.simulation.robot_twins import Twins
 from worker.simulation.robot_values import UNLIMITED, freedoms, without_contacts
 from worker.simulation.worlds import Worlds
@@ -203,8 +203,7 @@ def disturbed(model: Any, seed: int) -> Any:
 
 def in_muster(robot: Robot, twins: Twins, existing: Any, speeds: Any, controls: Any) -> Any:
     """From the velocities ``speeds`` of the built model on, the coordinates after one second in Muster's own worlds, in the built model's order, shape ``(nq,)``, float32."""
-    builder = newton.ModelBuilder()
-    SolverMuJoCo.register_custom_attributes(builder)
+    builder = empty_builder()
     if not existing.nu:
         robot = dataclasses.replace(robot, actuators=(EffortActuator("*"),))
     robot.add_to(builder)

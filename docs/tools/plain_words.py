@@ -58,6 +58,8 @@ PHRASES = {
 PUBLIC = frozenset({"wanted_joint_position", "wanted_joint_velocity", "wanted_anchor_position", "wanted_anchor_turn"})
 """Names of terms that users' tasks have."""
 
+_TEXTS = {tokenize.COMMENT, tokenize.STRING, getattr(tokenize, "FSTRING_MIDDLE", tokenize.STRING)}
+"""Python 3.12 has tokens of their own for the parts of an f-string."""
 _PARTS = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])")
 _PHRASE = re.compile("|".join(f"(?P<p{number}>{phrase})" for number, phrase in enumerate(PHRASES)), re.IGNORECASE)
 
@@ -84,20 +86,20 @@ def findings(path: Path, source: str) -> Iterator[tuple[int, str, str]]:
     if path.suffix != ".py":
         yield from ((line + 1, *rest) for line, *rest in in_text(source))  # type: ignore[misc]
         return
-    others: set[str] = set()
+    of_hypothesis: set[str] = set()
     before = ""
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        line, text = token.start[0], token.string
         if token.type == tokenize.NAME:
-            if token.line.startswith("from hypothesis") or (token.string == "tell" and before == "."):
-                others.add(token.string)  # of hypothesis, and of files
-            if token.string.startswith("test_"):  # a sentence
-                yield from ((token.start[0], *rest) for _, *rest in in_text(token.string.replace("_", " ")))  # type: ignore[misc]
-            elif token.string not in others:
-                found = in_names(token.string)
-                yield from ((token.start[0], f"{token.string}: {word}", plain) for word, plain in found)
-        elif token.type == tokenize.COMMENT or (token.type == tokenize.STRING and " " in token.string):  # no key
-            yield from ((token.start[0] + line, word, plain) for line, word, plain in in_text(token.string))
-        before = token.string
+            if token.line.startswith("from hypothesis"):
+                of_hypothesis.add(text)
+            if text.startswith("test_"):  # a sentence
+                yield from ((line, *rest) for _, *rest in in_text(text.replace("_", " ")))  # type: ignore[misc]
+            elif text not in of_hypothesis and not (text == "tell" and before == "."):  # a file's
+                yield from ((line, f"{text}: {word}", plain) for word, plain in in_names(text))
+        elif token.type in _TEXTS and (token.type != tokenize.STRING or " " in text):  # a string of one word is a key
+            yield from ((line + each, word, plain) for each, word, plain in in_text(text))
+        before = text
 
 
 def files(arguments: list[str]) -> Iterator[Path]:
@@ -106,7 +108,13 @@ def files(arguments: list[str]) -> Iterator[Path]:
     for name in filter(None, listed.stdout.split("\0")):
         path = ROOT / name
         if path.suffix in {".py", ".md", ".html", ".js"} and not name.startswith(
-            ("tests/data/", "CHANGELOG", "docs/tools/plain_words", "docs/tools/older_schemas/")
+            (
+                "tests/data/",
+                "CHANGELOG",
+                "docs/tools/plain_words",
+                "docs/tools/older_schemas/",
+                "tests/unit/test_plain_words",
+            )
         ):
             yield path
 

@@ -63,11 +63,26 @@ def evaluate(
     run's evaluations/ gets a Parquet file with one row per episode, and a summary. The job has one node, with the resources of the run's
     nodes, but at most one GPU.
     """
-    section = {"episodes": episodes, "worlds": worlds, "seed": seed}
-    section["accept_changed_robot"] = accept_changed_robot or None
-    modes: dict[str, Any] = {"queue": queue, "engine": engine, "store": store, "cpus": cpus}
-    modes |= {"follow": follow, "dry_run": dry_run, "as_json": as_json}
-    raise typer.Exit(follow_evaluation(source, section, set_, name, **modes))
+    section = {
+        "episodes": episodes,
+        "worlds": worlds,
+        "seed": seed,
+        "accept_changed_robot": accept_changed_robot or None,
+    }
+    code = follow_evaluation(
+        source,
+        section,
+        set_,
+        name,
+        queue=queue,
+        engine=engine,
+        store=store,
+        cpus=cpus,
+        follow=follow,
+        dry_run=dry_run,
+        as_json=as_json,
+    )
+    raise typer.Exit(code)
 
 
 def follow_evaluation(

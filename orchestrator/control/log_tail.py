@@ -45,7 +45,7 @@ class Tail:
     """Pushes that came before what precedes them, by position."""
     stated: int | None = None
     """End of the file as its node has stated it last."""
-    received: float = float("-inf")
+    received_at: float = float("-inf")
     """When that was [s]."""
     is_whole: bool = False
     """Whether its node has stated that nothing follows."""
@@ -68,7 +68,7 @@ class Tail:
 
     def delivers(self, now: float) -> bool:
         """Whether its node tells of each change, so that the file needs no look."""
-        return self.is_whole or now - self.received < FRESH
+        return self.is_whole or now - self.received_at < FRESH
 
     def read(self, position: int, most: int) -> bytes | None:
         """Up to ``most`` bytes from ``position`` on; None where only the file has them."""
@@ -203,7 +203,7 @@ class JobLogs:
                 return False
             tail = self._tails.setdefault(log, Tail(0))
             tail.stated, tail.is_whole = end, is_whole
-            tail.received = float("-inf") if end is None else machine.monotonic()
+            tail.received_at = float("-inf") if end is None else machine.monotonic()
             return tail.has_gap
 
     def note(self, attempt: int | None, nodes: int) -> bool:

@@ -130,11 +130,11 @@ class Presence:
         with self._lock:
             self._set(node, None)
 
-    def hear_itself(self, seen: bool) -> None:
+    def hear_itself(self, arrived: bool) -> None:
         """Whether the router hears the controller's own session, by way of the loopback network."""
         with self._lock:
             self._note_deafness()
-            self._hears_itself = seen
+            self._hears_itself = arrived
 
     def met(self, node: Node) -> bool:
         """Whether the node is or was connected, and has not ended."""

@@ -395,7 +395,7 @@ class Retention:
 
     @contextmanager
     def alone(self, name: str) -> Iterator[None]:
-        """A block in which nobody else uses the run, and in which no job begins that writes it. Raises RunNeeded where a request does."""
+        """A block in which no other request uses the run and no job starts that writes it. Raises RunNeeded if a request uses it."""
         if not self._take([name]):
             raise RunNeeded(f"run {name} is used by another request now; try again in a moment")
         try:

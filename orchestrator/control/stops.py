@@ -32,14 +32,14 @@ class _Stop:
     engine: str
     waited: bool
     """Whether all threads for the engine were busy."""
-    requested: float
+    requested_at: float
     """When it was requested (monotonic [s])."""
     result: Future[GangStatus]
 
     @property
     def unreported(self) -> float:
         """Seconds until its job says that it waits, or has waited; 0 from then on."""
-        return max(0.0, self.requested + _QUIET - machine.monotonic()) if self.waited else inf
+        return max(0.0, self.requested_at + _QUIET - machine.monotonic()) if self.waited else inf
 
 
 class Stops:
@@ -121,9 +121,9 @@ class Stops:
             self._pools[engine] = machine.pool(f"stop {engine}", _THREADS)
         waits = self._busy[engine] >= _THREADS
         self._busy[engine] += 1
-        requested = machine.monotonic()
-        result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, requested if waits else inf))
-        self._under_way[key] = _Stop(engine, waits, requested, result)
+        requested_at = machine.monotonic()
+        result = self._pools[engine].submit(partial(self._stop, key[0], handle, grace, requested_at if waits else inf))
+        self._under_way[key] = _Stop(engine, waits, requested_at, result)
         result.add_done_callback(lambda _: self._changed(key[0]))
 
     def _take(self, key: Key) -> _Stop:

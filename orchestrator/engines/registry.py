@@ -135,8 +135,8 @@ class EngineSet:
             values = [self.secrets.of(node.container, gang.queue) for node in gang.nodes]
         except SecretsError as error:
             raise EngineError(str(error)) from None
-        supplied = zip(gang.nodes, values, strict=True)
-        return replace(gang, nodes=[replace(node, environment={**node.environment, **more}) for node, more in supplied])
+        pairs = zip(gang.nodes, values, strict=True)
+        return replace(gang, nodes=[replace(node, environment={**node.environment, **more}) for node, more in pairs])
 
     def check_secrets(self, names: Iterable[str], containers: Sequence[Mapping[str, Any]], queue: str) -> None:
         """Raises SecretsError where a job of this queue on one of these engines can't have the secrets that it requests."""

@@ -87,7 +87,7 @@ class _Observed:
     is_new: bool = True
     """It was not polled yet."""
     status: GangStatus | None = None
-    requested: float = 0.0
+    requested_at: float = 0.0
     """When the engine was asked for that status (monotonic [s])."""
 
 
@@ -259,7 +259,7 @@ class Runner:
         known = self._observed.get(handle)
         if known is None or known.status is None or self._trouble(handle):
             return None
-        return machine.monotonic() - known.requested
+        return machine.monotonic() - known.requested_at
 
     def _trouble(self, handle: Handle) -> str | None:
         """Why there is no newer status of a gang."""
@@ -374,7 +374,7 @@ class Runner:
 
     def _look(self, handles: Sequence[Handle]) -> None:
         before = self._backoff.failure(_LOOKS)
-        requested = machine.monotonic()
+        requested_at = machine.monotonic()
         looks: Sequence[Look] = ()
         try:
             looks = self._call("look at its gangs", lambda: self._statuses(handles))
@@ -382,7 +382,9 @@ class Runner:
             self._failed(_LOOKS, error)
         else:
             self._backoff.worked(_LOOKS)
-        changed = [handle for handle, look in zip(handles, looks, strict=False) if self._note(handle, look, requested)]
+        changed = [
+            handle for handle, look in zip(handles, looks, strict=False) if self._note(handle, look, requested_at)
+        ]
         for handle in changed if before == self._backoff.failure(_LOOKS) else list(self._observed):
             self._changed(handle.gang)
 
@@ -392,14 +394,14 @@ class Runner:
             raise ValueError(f"{len(looks)} statuses of {len(handles)} gangs")
         return looks
 
-    def _note(self, handle: Handle, look: Look, requested: float) -> bool:
+    def _note(self, handle: Handle, look: Look, requested_at: float) -> bool:
         """Keep a status; returns whether it differs from the one before."""
         subject = ("look", handle)
         with self._lock:
             if (known := self._observed.get(handle)) is None:
                 return False  # it was forgotten meanwhile
             if not isinstance(look, BaseException):
-                before, known.status, known.requested = known.status, look, requested
+                before, known.status, known.requested_at = known.status, look, requested_at
                 return self._backoff.worked(subject) or before != look
 
         def fail() -> None:

@@ -118,10 +118,10 @@ class KeyStore:
 
         Where the database does not answer in time, what was read last stays in force.
         """
-        requested = machine.monotonic()
+        requested_at = machine.monotonic()
         if self._polling.acquire(timeout=PATIENCE):
             try:
-                if self._polled <= requested:
+                if self._polled <= requested_at:
                     self._poll_safely()
             finally:
                 self._polling.release()

@@ -58,7 +58,7 @@ class _Origin:
             for each, how in kept_files(task_config(name) if isinstance(name, str) else None).items():
                 yield section, config, each, how
 
-    def supplied(self, document: Mapping[str, Any]) -> Iterator[tuple[str, str, Any, KeptFile]]:
+    def present_fields(self, document: Mapping[str, Any]) -> Iterator[tuple[str, str, Any, KeptFile]]:
         """Section, name, value and form of the fields that the document gives."""
         return (
             (section, name, config[name], how) for section, config, name, how in self.fields(document) if name in config
@@ -85,8 +85,8 @@ class _Origin:
         if not how.check or any(find_spec(each) is None for each in how.needs):
             return
         command = [sys.executable, "-P", "-m", how.check, path]
-        if how.supplied:
-            command += ["--config", json.dumps({each: config[each] for each in how.supplied if each in config})]
+        if how.check_reads:
+            command += ["--config", json.dumps({each: config[each] for each in how.check_reads if each in config})]
             command += ["--store", store] if (store := self.store()) is not None else []
         response = subprocess.run(command, capture_output=True, text=True, check=False)
         output = [line.replace(path, name or path, 1) for line in response.stderr.strip().splitlines()]
@@ -109,7 +109,7 @@ class _Origin:
         """Check the texts of ``base`` where a section changes what their check depends on. Raises SpecError."""
         for section, config, name, how in self.fields(document):
             whole = self.whole(section, document[section])
-            changed = [key for key in how.supplied if whole.get(key) != self.base.get(key)]
+            changed = [key for key in how.check_reads if whole.get(key) != self.base.get(key)]
             if changed and name not in config:
                 with self.at(section, changed[0]):
                     self.check_text(self.with_text(self.base.get(name), name), name, how, whole)
@@ -156,7 +156,7 @@ def with_files(
         SpecError: A file can't be read, is too large, or its check refuses it; one line with file, line and key.
     """
     result, origin = dict(document), _Origin(source, lines, task, base or {}, store, note, text_of)
-    for section, name, value, how in origin.supplied(document):
+    for section, name, value, how in origin.present_fields(document):
         if isinstance(value, str):
             with origin.at(section, name):
                 content = _content(value, how)
@@ -176,7 +176,7 @@ def refuse_paths(document: Mapping[str, Any], source: str, lines: Lines) -> None
         SpecError: A path stands where the content of its file belongs, or a content is too large; one line with key and line.
     """
     origin = _Origin(source, lines)
-    for section, name, value, how in origin.supplied(document):
+    for section, name, value, how in origin.present_fields(document):
         with origin.at(section, name):
             if isinstance(value, str):
                 form = "{file: NAME, text: …}" if how.form == "text" else "the value in it"
@@ -191,7 +191,7 @@ def check_texts(
 ) -> None:
     """Check the texts that stand in the place of files, as :func:`with_files` checks files. Arguments and errors as there."""
     origin = _Origin(source, lines, store=store, note=note)
-    for section, name, value, how in origin.supplied(document):
+    for section, name, value, how in origin.present_fields(document):
         with origin.at(section, name):
             origin.check_text(value, name, how, origin.whole(section, document[section]))
 

@@ -70,7 +70,7 @@ class PolicyNode:
         bundle: Verified.
         settings: Its settings.
         policy: Of the bundle, after its self-test.
-        tell: Called with each line of text.
+        report: Called with each line of text.
 
     Raises:
         Refused: The policy needs a quantity that no message has, or a setting does not fit.

@@ -52,7 +52,7 @@ class Lines:
     """Passes lines to a thread that prints them.
 
     Args:
-        tell: Called with each line.
+        report: Called with each line.
     """
 
     def __init__(self, report: Callable[[str], None]) -> None:

@@ -20,7 +20,7 @@ _RACE = "Race"
 
 def race_or_evaluate(
     evaluate: Callable[..., None],
-    supplied: dict[str, Any],
+    arguments: dict[str, Any],
     *,
     race: Annotated[
         bool,
@@ -64,29 +64,29 @@ def race_or_evaluate(
 ) -> None:
     """Evaluate a checkpoint, or have it drive a race. Raises what :func:`.follow_evaluation` raises."""
     rules = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None, "output": output}
-    _refuse_mixed(race, {"episodes": supplied["episodes"], "worlds": supplied["worlds"]}, rules)
+    _refuse_mixed(race, {"episodes": arguments["episodes"], "worlds": arguments["worlds"]}, rules)
     if not race:
-        evaluate(**supplied)
+        evaluate(**arguments)
         return
     for existing in () if output is None else (output / each for each in (SIM_TRACE, *BESIDE)):
         if existing.exists():
             raise UsageError(f"-o {output}: {existing} exists; name another directory")
     section = {
-        "seed": supplied["seed"],
+        "seed": arguments["seed"],
         "trials": trials,
         "continuous": continuous,
         "track": track or None,
         "off_track_penalty": penalty,
         "crash_penalty": penalty,
-        "accept_changed_robot": supplied["accept_changed_robot"] or None,
+        "accept_changed_robot": arguments["accept_changed_robot"] or None,
     }
-    modes = {key: supplied[key] for key in ("queue", "engine", "store", "cpus", "follow", "dry_run", "as_json")}
+    modes = {key: arguments[key] for key in ("queue", "engine", "store", "cpus", "follow", "dry_run", "as_json")}
 
     def copy(run: Path, evaluation: str) -> None:
         if output is not None:
-            _copy(run, evaluation, output, supplied["as_json"])
+            _copy(run, evaluation, output, arguments["as_json"])
 
-    what = supplied["source"], section, supplied["set_"], supplied["name"]
+    what = arguments["source"], section, arguments["set_"], arguments["name"]
     raise typer.Exit(follow_evaluation(*what, kind="race", then=copy, **modes))
 
 

@@ -1,6 +1,6 @@
 """Sample inputs of reward functions: cars, and objects, placed on the tracks of a job, or on an oval.
 
-NumPy is imported where it is used, since whoever reads a task's settings imports this.
+NumPy is imported where it is used: reading a task's settings imports this module.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ def action_space(content: Any) -> ActionSpace:
     looked at.
 
     Raises:
-        Refused: It has none, a value is not a number, or there is no such sensor.
+        Refused: It has no actions, a value is not a number, or a sensor is unknown.
     """
     if isinstance(content, Sequence) and not isinstance(content, str):
         content = {"action_space": content}

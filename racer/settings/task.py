@@ -126,7 +126,7 @@ class RacerConfig(TaskConfig):
         Annotated[RewardFile | str | None, expecting("the path of a reward function")], from_mapping(RewardFile)
     ] = field(
         default=None,
-        metadata=kept_file("text", "racer.rewards", needs=("numpy", "scipy"), supplied=("track", "obstacles")),
+        metadata=kept_file("text", "racer.rewards", needs=("numpy", "scipy"), check_reads=("track", "obstacles")),
     )
     """Path of a file with ``def reward_function(params)``, which replaces all other rewards."""
     speed_lag: Amount = 0.2

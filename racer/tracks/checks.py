@@ -30,7 +30,7 @@ RINGS = ("centre line", "inner border", "outer border")
 
 _BLOCK = 512
 """Segments that are compared with all others at once."""
-_REPORTED = 1000
+_MOST_REPORTED = 1000
 """Crossings of each block among which the one to report is looked for."""
 
 
@@ -169,7 +169,7 @@ def first_crossing(rings: tuple[Floats, ...], closed: bool = True) -> tuple[int,
         other = (i < j) & ((which[i] != which[j]) | ~neighbours)
         i, j = i[other], j[other]
         meet = _straddles(start[i], end[i], start[j], end[j]) & _straddles(start[j], end[j], start[i], end[i])
-        for k, m in zip(i[meet][:_REPORTED], j[meet][:_REPORTED], strict=True):
+        for k, m in zip(i[meet][:_MOST_REPORTED], j[meet][:_MOST_REPORTED], strict=True):
             a, b = int(which[k]), int(which[m])
             found.append((a != b, a, int(kept[a][place[k]]), b, int(kept[b][place[m]])))
     return min(found)[1:] if found else None

@@ -75,7 +75,7 @@ def explain(problem: Mapping[str, Any]) -> str:
 
 
 def counted(count: int, noun: str, plural: str = "") -> str:
-    """A count with its noun: ``1 episode``, ``100 episodes``; ``things``: an irregular plural."""
+    """A count with its noun: ``1 episode``, ``100 episodes``; ``plural``: an irregular plural."""
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 

@@ -24,7 +24,7 @@ class KeptFile:
         check: A module; ``python -m MODULE FILE`` exits with 0 for a valid file, and its standard error has notes for the user;
             otherwise its last line names the error.
             Empty: the configuration's class checks enough.
-        given: Other fields of the configuration that the check depends on; it gets them as JSON after ``--config``, and the store's path
+        check_reads: Other fields of the configuration that the check depends on; it gets them as JSON after ``--config``, and the store's path
             after ``--store``.
         needs: Packages without which the check would refuse valid files: if the command lacks one, the node checks.
     """
@@ -32,14 +32,14 @@ class KeptFile:
     form: Literal["text", "json"]
     check: str = ""
     needs: tuple[str, ...] = ()
-    supplied: tuple[str, ...] = ()
+    check_reads: tuple[str, ...] = ()
 
 
 def kept_file(
-    form: Literal["text", "json"], check: str = "", needs: tuple[str, ...] = (), supplied: tuple[str, ...] = ()
+    form: Literal["text", "json"], check: str = "", needs: tuple[str, ...] = (), check_reads: tuple[str, ...] = ()
 ) -> Mapping[str, Any]:
     """The metadata of such a field; for the arguments see :class:`KeptFile`."""
-    return {_KEY: KeptFile(form, check, needs, supplied)}
+    return {_KEY: KeptFile(form, check, needs, check_reads)}
 
 
 def kept_files(kind: Any) -> dict[str, KeptFile]:

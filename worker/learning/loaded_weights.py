@@ -53,16 +53,16 @@ def adopt(job: Job, gang: Gang, algorithm: Algorithm, facts: Mapping[str, Any]) 
     if checkpoint is None:
         return None
     learnt: Any = read_file(checkpoint, "learner.pt", gang.device).get("algorithm")
-    existing, here = checkpoint.manifest, json.loads(json.dumps(facts))
+    saved, here = checkpoint.manifest, json.loads(json.dumps(facts))
     _check_settings(checkpoint, here, algorithm)
     try:
         algorithm.load_state_dict(learnt, weights_only=True)
     except (RuntimeError, ValueError, KeyError, TypeError, AttributeError) as error:
         why = _difference(algorithm.state_dict(), learnt) or " ".join(str(error).split())[:300]
         raise UserError(
-            f"the weights of checkpoint {checkpoint.name} do not fit this job: {why}{_context(existing, here)}"
+            f"the weights of checkpoint {checkpoint.name} do not fit this job: {why}{_context(saved, here)}"
         ) from error
-    then, now = (contract_from(facts, checkpoint.name) for facts in (existing, here))
+    then, now = (contract_from(facts, checkpoint.name) for facts in (saved, here))
     if gang.is_main and then and now:
         if lines := differences(then, now, ranges=True):
             print(f"warning: the weights were learnt with another policy contract: {brief(lines)}", flush=True)
@@ -105,15 +105,15 @@ def load_teacher(job: Job, gang: Gang, algorithm: Algorithm, adopted: Checkpoint
 
 def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: Algorithm) -> None:
     """Check settings whose difference tensors would not show, or only in many lines. Raises UserError with the first difference."""
-    existing = checkpoint.manifest
-    if (learnt := existing.get("algorithm")) != here["algorithm"]:
+    manifest = checkpoint.manifest
+    if (learnt := manifest.get("algorithm")) != here["algorithm"]:
         if not any(":" in str(name) for name in (learnt, here["algorithm"])):
             raise UserError(
                 f"the weights of checkpoint {checkpoint.name} are of algorithm {learnt}, which {here['algorithm']} can't read; set "
                 f"train.algorithm: {learnt}, or a module:Class of your own whose load_state_dict reads them"
             )
         return  # whether a class of the user's own reads the other's, or is read, only the loading shows
-    saved = existing.get("settings") or {}
+    saved = manifest.get("settings") or {}
     if changed := changed_setting(algorithm.config_type, saved, here["settings"], saved, of_clone=True):
         key, old, new, _ = changed
         raise UserError(
@@ -122,16 +122,16 @@ def _check_settings(checkpoint: Checkpoint, here: Mapping[str, Any], algorithm: 
         )
 
 
-def _context(existing: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+def _context(saved: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """The differences in algorithm or in the policy's inputs and outputs, as text; empty without any."""
-    if existing.get("algorithm") != here["algorithm"]:
-        return f"; they are of algorithm {existing.get('algorithm')}, and {here['algorithm']} does not read them"
+    if saved.get("algorithm") != here["algorithm"]:
+        return f"; they are of algorithm {saved.get('algorithm')}, and {here['algorithm']} does not read them"
     spaces = []
-    for facts in (existing, here):
+    for facts in (saved, here):
         policy = facts.get("policy") or {}
         groups = ", ".join(f"{name} {shape}" for name, shape in sorted((policy.get("groups") or {}).items()))
         spaces.append(f"observations {groups} and {policy.get('action_size')} actions")
-    tasks = [f"(task {facts.get('task')})" for facts in (existing, here)]
+    tasks = [f"(task {facts.get('task')})" for facts in (saved, here)]
     return "" if spaces[0] == spaces[1] else f"; there {spaces[0]} {tasks[0]}, here {spaces[1]} {tasks[1]}"
 
 
@@ -139,13 +139,13 @@ def _difference(own: Any, saved: Any) -> str:
     """The first tensor of the networks that is missing on one side or has another shape; empty without any."""
     if not isinstance(saved, Mapping):
         return f"it holds a {type(saved).__name__} where the state of an algorithm is expected"
-    here, existing = (dict(_shapes(each)) for each in (own, saved))
+    here, theirs = (dict(_shapes(each)) for each in (own, saved))
     for name in here:
-        if name in existing and existing[name] != here[name]:
-            return f"{name} has shape {existing[name]} there and {here[name]} here"
-    if missing := [name for name in here if name not in existing]:
+        if name in theirs and theirs[name] != here[name]:
+            return f"{name} has shape {theirs[name]} there and {here[name]} here"
+    if missing := [name for name in here if name not in theirs]:
         return f"{missing[0]} is not there"
-    return next((f"{name} is there, and this job's algorithm has none" for name in existing if name not in here), "")
+    return next((f"{name} is there, and this job's algorithm has none" for name in theirs if name not in here), "")
 
 
 def _shapes(state: Any, path: str = "") -> Iterator[tuple[str, tuple[int, ...]]]:

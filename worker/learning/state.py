@@ -267,35 +267,31 @@ class TrainingState:
 
     def _changed(self, checkpoint: Checkpoint) -> set[str]:
         """The algorithm's settings that differ from those of ``checkpoint``, or that this job sets and that one did not."""
-        existing, here = (json.loads(json.dumps(facts)) for facts in (checkpoint.manifest, self.facts))
+        saved, here = (json.loads(json.dumps(facts)) for facts in (checkpoint.manifest, self.facts))
         keys = f"train.{section_of(here['algorithm'])}", "settings"
-        pairs = [(setting_at(existing, key) or {}, setting_at(here, key) or {}) for key in keys]
+        pairs = [(setting_at(saved, key) or {}, setting_at(here, key) or {}) for key in keys]
         return {name for old, new in pairs for name in new if old.get(name) != new[name]}
 
     def _check_fit(self, checkpoint: Checkpoint) -> None:
         """Compare the manifest with this job, before any tensor is loaded. Raises UserError with the first difference."""
-        existing, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
-        if "algorithm" not in existing:
+        saved, here = checkpoint.manifest, json.loads(json.dumps(self.facts))
+        if "algorithm" not in saved:
             raise UserError(
                 f"checkpoint {checkpoint.name} is of an older Muster, which knew no algorithms; start a new run"
             )
-        trains = [
-            {**facts["train"], "task": facts["task"], "algorithm": facts["algorithm"]} for facts in (existing, here)
-        ]
-        changed = changed_setting(
-            self.algorithm.config_type, existing["settings"], here["settings"], existing["settings"]
-        )
+        trains = [{**facts["train"], "task": facts["task"], "algorithm": facts["algorithm"]} for facts in (saved, here)]
+        changed = changed_setting(self.algorithm.config_type, saved["settings"], here["settings"], saved["settings"])
         if difference := changed_task(self.task.config, *trains) or changed:
             key, old, new, *of_algorithm = difference
             if of_algorithm:
-                key = f"{section_of(existing['algorithm'])}.{key}"
+                key = f"{section_of(saved['algorithm'])}.{key}"
             elif key not in ("task", "algorithm"):
                 key = f"train.{key}"
             raise UserError(
                 f"checkpoint {checkpoint.name} does not fit this job's task and algorithm: {key} is {old!r} there and {new!r} "
                 "here; start a new run for that (`muster clone` begins one with its weights)"
             )
-        then, now = (contract_from(facts, checkpoint.name) for facts in (existing, here))
+        then, now = (contract_from(facts, checkpoint.name) for facts in (saved, here))
         accept = bool(self.job.section.get("accept_changed_robot"))
         changes = check_robots(then, self.task, f"checkpoint {checkpoint.name}", accept=accept)
         if self.gang.is_main:

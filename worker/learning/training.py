@@ -95,15 +95,15 @@ def as_started(training: Training, gang: Gang) -> tuple[Training, str]:
 def _kept(training: Training) -> dict[str, Any]:
     """The settings that differ from those of today and that nobody set, by name; their values are as in JSON."""
     found = _checkpoint(training.job)
-    existing = found[0].manifest if found else {}
-    if not found or existing.get("algorithm") != training.algorithm:
+    saved = found[0].manifest if found else {}
+    if not found or saved.get("algorithm") != training.algorithm:
         return {}
     kind: Any = type(training.settings)
     key = f"train.{section_of(training.algorithm)}"
-    set_by_job = {*(setting_at(existing, key) or {}), *(training.job.section.get(section_of(training.algorithm)) or {})}
-    then = {**getattr(kind, "before", {}), **(existing.get("settings") or {})}
+    set_by_job = {*(setting_at(saved, key) or {}), *(training.job.section.get(section_of(training.algorithm)) or {})}
+    then = {**getattr(kind, "before", {}), **(saved.get("settings") or {})}
     now = json.loads(json.dumps(dataclasses.asdict(training.settings)))
-    names = fixed_settings(kind, existing.get("settings") or {}, of_clone=True) if found[1] else now
+    names = fixed_settings(kind, saved.get("settings") or {}, of_clone=True) if found[1] else now
     return {
         name: then[name] for name in names if name not in set_by_job and name in then and then[name] != now.get(name)
     }

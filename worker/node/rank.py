@@ -58,7 +58,7 @@ class Rank:
         """Its stacks when it had made no progress for too long."""
         self.progress: dict[str, Any] = {}
         """The newest of everything that it reported (:class:`worker.learning.reporter.Beacon`)."""
-        self.received: float | None = None
+        self.last_report: float | None = None
         """Time of its last message about an iteration (monotonic [s]); None before the first and after the last iteration."""
         self.spoke = time.monotonic()
         """Time of its start or of its last message (monotonic [s])."""
@@ -192,11 +192,11 @@ class Rank:
                 continue
             iteration = message.get("iteration")
             if type(iteration) is int and 0 <= iteration < _LARGEST_NUMBER:
-                self.received = time.monotonic()
+                self.last_report = time.monotonic()
             else:
                 message.pop("iteration", None)
             if message.get("done"):
-                self.received = None
+                self.last_report = None
             for key in {"message", "said"} & message.keys():  # the second is its name in older versions
                 reports.append(str(message.pop(key))[:_LONGEST_VALUE])
             for name, value in message.items():

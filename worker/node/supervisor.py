@@ -195,7 +195,9 @@ class Supervisor:
         if (timeout := self.contract.stall_timeout) is None:
             return False
         # before the first iteration (kernels are compiled) and after the last (evaluation) only the time limits tell a stall
-        since, limit = (rank.received, timeout) if rank.received is not None else (rank.spoke, max(timeout, _PATIENCE))
+        since, limit = (
+            (rank.last_report, timeout) if rank.last_report is not None else (rank.spoke, max(timeout, _PATIENCE))
+        )
         if (silence := time.monotonic() - since) < limit:
             return False
         if any(key.data == (rank, "beacon") for key, _ in self.selector.select(0)):
@@ -229,7 +231,7 @@ class Supervisor:
             elif command.name == "stacks":
                 found = []
                 for rank in self.ranks:
-                    title, speaks = f"stacks of rank {rank.number}, asked for:", rank.received is not None
+                    title, speaks = f"stacks of rank {rank.number}, asked for:", rank.last_report is not None
                     found += [f"rank {rank.number}:", *self._log_stacks(rank, title, speaks=speaks)]
                 command.reply("\n".join(found))
             elif command.name == "stop":
@@ -242,11 +244,11 @@ class Supervisor:
         """Ask the ranks to save now (SIGUSR2); the answer follows when the first save after that is durable."""
         rank = self.ranks[0]
         if (
-            rank.running and rank.received is None and self.contract.stall_timeout is not None
+            rank.running and rank.last_report is None and self.contract.stall_timeout is not None
         ):  # which only a training has
             command.reply(f"job {self.contract.job[:8]} has not begun its first iteration: nothing to save yet")
             return
-        if not rank.running or rank.received is None:
+        if not rank.running or rank.last_report is None:
             command.reply("not training: there is nothing to save now")
             return
         self._saving.append((rank.progress["iteration"], command))

@@ -28,5 +28,5 @@ def is_out_of_memory(error: BaseException) -> bool:
     """Whether torch, Warp or Python found no memory: torch says so with RuntimeErrors, of which not all have a type of their own."""
     phrases = ("Failed to allocate", "out of memory", "can't allocate memory")
     return isinstance(error, MemoryError) or (
-        isinstance(error, RuntimeError) and any(words in str(error) for words in phrases)
+        isinstance(error, RuntimeError) and any(phrase in str(error) for phrase in phrases)
     )

@@ -144,7 +144,7 @@ class RslRlConfig:
 
 
 def _changed(default: Mapping[str, Any], supplied: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of ``given``, or, if it names no class, of ``default`` with its changes."""
+    """A copy of ``supplied``, or, if it names no class, of ``default`` with its changes."""
     known: Mapping[str, Any] = {} if "class_name" in supplied else default
     return {key: _copy(value, known.get(key)) for key, value in {**known, **supplied}.items()}
 

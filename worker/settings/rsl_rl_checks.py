@@ -146,7 +146,7 @@ def check_networks(kind: str, distils: bool, supplied: Mapping[str, Any], teache
     Args:
         kind: Name of its class.
         distils: Whether it imitates a teacher.
-        given: The job's sections of networks, by name; None for omitted ones.
+        supplied: The job's sections of networks, by name; None for omitted ones.
         teacher: The run that trained the teacher.
 
     Raises:

@@ -115,12 +115,12 @@ def _of_all_robots(entry: Randomize, worlds: Worlds, views: Mapping[str, RobotVi
     patterns = [pattern] if isinstance(pattern, str) else pattern
     for view in views.values():
         names = view.body_names if parts == "bodies" else view.joint_names
-        existing = [index for index, name in enumerate(names) if any(fnmatchcase(name, each) for each in patterns)]
+        matching = [index for index, name in enumerate(names) if any(fnmatchcase(name, each) for each in patterns)]
         if parts == "bodies":
-            existing = [body for body in existing if masses[view.bodies[body]] > 0.0]
+            matching = [body for body in matching if masses[view.bodies[body]] > 0.0]
         elif parts == "actuators":
-            existing = [joint for joint in existing if view.actuators[joint] >= 0]
-        own = _of_robot(entry, worlds, view, existing)
+            matching = [joint for joint in matching if view.actuators[joint] >= 0]
+        own = _of_robot(entry, worlds, view, matching)
         changes = (dataclasses.replace(each, element=each.element + len(found.names)) for each in own.changes)
         found = EntryTargets((*found.names, *own.names), (*found.changes, *changes))
     if not found.names:
@@ -196,15 +196,15 @@ def _geoms(entry: Randomize, worlds: Worlds, names: list[str], shapes: list[int]
     axes = [(entry.quantity.axes.index(axis), number) for number, axis in enumerate(entry.drawn_axes)]
     if entry.what == "contact_friction":
         axes = [(axis, 0) for axis in range(3)]
-    existing = [(name, columns[shape]) for name, shape in zip(names, shapes, strict=True) if shape in columns]
-    if not existing:
+    own_shapes = [(name, columns[shape]) for name, shape in zip(names, shapes, strict=True) if shape in columns]
+    if not own_shapes:
         raise ValueError(f"geoms {', '.join(names)} touch nothing, so they have no friction; choose geoms that collide")
     changes = (
         Change("geom_friction", 3 * geom + axis, element, number, least=LEAST_FRICTION)
-        for element, (_, geom) in enumerate(existing)
+        for element, (_, geom) in enumerate(own_shapes)
         for axis, number in axes
     )
-    return EntryTargets(tuple(name for name, _ in existing), tuple(changes))
+    return EntryTargets(tuple(name for name, _ in own_shapes), tuple(changes))
 
 
 def _joints(entry: Randomize, worlds: Worlds, view: RobotView, chosen: list[int]) -> EntryTargets:

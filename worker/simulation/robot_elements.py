@@ -120,12 +120,12 @@ def names_of(model: Any, kind: str, indices: Iterable[int]) -> dict[int, str]:
     return {index: names[index] if mujoco.mj_id2name(model, kind_of(kind), index) else "" for index in indices}
 
 
-def paired(existing: dict[int, str], here: dict[int, str]) -> Pairs:
+def paired(in_file: dict[int, str], here: dict[int, str]) -> Pairs:
     """Match elements by name, and those without a name in their order."""
     by_name = {name: index for index, name in here.items()}
-    pairs = {index: by_name[name] for index, name in existing.items() if name and name in by_name}
+    pairs = {index: by_name[name] for index, name in in_file.items() if name and name in by_name}
     rest = [index for index in here if index not in pairs.values()]
-    unnamed = [index for index, name in existing.items() if not name]
+    unnamed = [index for index, name in in_file.items() if not name]
     return pairs | dict(zip(unnamed, rest, strict=False))
 
 

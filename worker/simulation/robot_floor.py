@@ -64,18 +64,18 @@ def notes(model: Any, floors: Any, *, is_placed: bool, has_contacts: bool) -> It
     for floor in range(floors.ngeom if floors else 0):
         name = f"the file's {name_of(floors, mujoco.mjtObj.mjOBJ_GEOM, floor)}"
         moving = [geom for geom in range(model.ngeom) if model.body_weldid[model.geom_bodyid[geom]]]
-        existing = {geom for geom in moving if _touch(model, geom, floors, floor)}
-        here = {geom for geom in moving if _touch(model, geom, GROUND, 0)}
+        in_file = {geom for geom in moving if _touch(model, geom, floors, floor)}
+        in_muster = {geom for geom in moving if _touch(model, geom, GROUND, 0)}
         masks = f"contype {floors.geom_contype[floor]} and conaffinity {floors.geom_conaffinity[floor]}"
-        if has_contacts and existing - here:
+        if has_contacts and in_file - in_muster:
             yield (
-                f"Muster's ground (contype 1 and conaffinity 1) does not hold what {name} ({masks}) holds: {_names(model, existing - here)}; "
+                f"Muster's ground (contype 1 and conaffinity 1) does not hold what {name} ({masks}) holds: {_names(model, in_file - in_muster)}; "
                 f"give these geoms other masks by collisions=(Collision(...),); or, {KEEP}"
             )
-        if has_contacts and here - existing:
-            yield f"Muster's ground touches what {name} ({masks}) does not: {_names(model, here - existing)}; {KEEP}"
+        if has_contacts and in_muster - in_file:
+            yield f"Muster's ground touches what {name} ({masks}) does not: {_names(model, in_muster - in_file)}; {KEEP}"
         found = [*_place(floors, floor)] if is_placed else []
-        found += _contacts(model, sorted(existing & here), floors, floor) if has_contacts else []
+        found += _contacts(model, sorted(in_file & in_muster), floors, floor) if has_contacts else []
         if found:
             yield f"Muster's ground takes the place of {name}, which has another {', another '.join(found)}; {KEEP}"
 

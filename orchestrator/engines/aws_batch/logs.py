@@ -41,7 +41,7 @@ class CopiedLog:
     token: str | None = None
     ended: float | None = None
     """When the node was first seen to have ended (monotonic [s])."""
-    received: float = 0.0
+    received_at: float = 0.0
     """When a line last came (monotonic [s])."""
     outcome: Outcome | None = None
     whole: bool = False
@@ -54,7 +54,7 @@ class CopiedLog:
         for event in events:
             if self.outcome is not None:
                 break
-            self.received = time.monotonic()
+            self.received_at = time.monotonic()
             message = str(event["message"])
             line = parse_line(message, 0, 0) if self.supervised else None
             if line is None:
@@ -70,7 +70,7 @@ class CopiedLog:
 
     def settle(self, quiet: float) -> None:
         """Note whether all is there: the outcome has come, or nothing has for ``quiet`` seconds after the end."""
-        silent = self.ended is not None and time.monotonic() - max(self.ended, self.received) > quiet
+        silent = self.ended is not None and time.monotonic() - max(self.ended, self.received_at) > quiet
         self.whole = (self.copy is None or self.copy.is_whole) and (self.outcome is not None or silent)
 
 

@@ -212,7 +212,7 @@ class DockerEngine:
                     self._follow(container, handle, index)
         except BaseException as error:
             self._remove(gang.name)  # never half a gang
-            # 500: it has tried, and reported why it can't; beyond that nobody has
+            # up to 500 the daemon tried and explains its failure; above, something between us and the daemon failed
             if isinstance(error, APIError) and (error.status_code or 500) <= 500:
                 why = f"CannotStartContainerError: Error response from daemon: {error.explanation}"
                 raise CannotStart(why) from error

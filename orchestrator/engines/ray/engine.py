@@ -233,7 +233,7 @@ class RayEngine:
     def _outwait(folder: Folder, gang: str) -> None:
         """The driver died. Ray ends the actors of a dead driver, and an actor that hears of none for a while ends itself."""
         folder.plan(gang).unlink(missing_ok=True)
-        with contextlib.suppress(OSError):  # there is no heartbeat of one that never joined the cluster
+        with contextlib.suppress(OSError):  # a driver that never joined the cluster left no heartbeat
             age = time.time() - folder.alive.stat().st_mtime
             time.sleep(min(max(0.0, LEASE + 1.0 - age), LEASE + 1.0))
         if state := read_json(folder.state(gang)):

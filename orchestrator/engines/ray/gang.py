@@ -52,7 +52,7 @@ class DrivenGang:
         fresh = {"running": True, "started": False, "address": "", "gpus": "", "code": None, "detail": ""}
         self.nodes: list[dict[str, Any]] = [{**fresh, "ray_node": node["pin"] or ""} for node in self.plan["nodes"]]
         self.actors: list[Any] = []
-        self.calls: dict[Any, tuple[str, int]] = {}
+        self.pending_calls: dict[Any, tuple[str, int]] = {}
         """Calls of actors that are not answered: a kind and a node's index."""
         self.last_replies = [time.monotonic()] * len(self.nodes)
         self.leaving: set[int] = set()
@@ -79,7 +79,7 @@ class DrivenGang:
     @property
     def is_stopping(self) -> bool:
         """Whether a node that was asked to end, or that is to say how it ended, has not answered yet."""
-        return any(kind in ("stop", "wait") for kind, _ in self.calls.values())
+        return any(kind in ("stop", "wait") for kind, _ in self.pending_calls.values())
 
     def end(self, index: int, code: int | None, detail: str, cause: Cause | None = None) -> None:
         """``cause``: where it is another one than the exit code says."""
@@ -103,7 +103,7 @@ class DrivenGang:
     def _ask(self, kind: str, index: int, *arguments: Any) -> Any:
         """Call a method of a node's actor; :meth:`listen` takes the answer."""
         reference = getattr(self.actors[index], kind).remote(*arguments)
-        self.calls[reference] = (kind, index)
+        self.pending_calls[reference] = (kind, index)
         return reference
 
     def place(self, group: Any) -> None:
@@ -150,7 +150,7 @@ class DrivenGang:
         """Ask every node that can be reached to end; :meth:`listen` notes when they have."""
         self.phase, self.why, self.deadline = "stopping", "", time.monotonic() + grace + _ENDING
         lost = self.lost  # nobody is there to answer
-        self.calls = {reference: call for reference, call in self.calls.items() if call[1] not in lost}
+        self.pending_calls = {reference: call for reference, call in self.pending_calls.items() if call[1] not in lost}
         for index in range(len(self.actors)):
             if index not in lost:
                 self._ask("stop", index, grace)
@@ -164,12 +164,12 @@ class DrivenGang:
 
     def listen(self, seconds: float) -> None:
         """Take what actors answer within that time, and what became of those that do not."""
-        if not self.calls:
+        if not self.pending_calls:
             time.sleep(seconds)
         else:
-            ray.wait(list(self.calls), num_returns=1, timeout=seconds)
-            for reference in ray.wait(list(self.calls), num_returns=len(self.calls), timeout=0)[0]:
-                kind, index = self.calls.pop(reference)
+            ray.wait(list(self.pending_calls), num_returns=1, timeout=seconds)
+            for reference in ray.wait(list(self.pending_calls), num_returns=len(self.pending_calls), timeout=0)[0]:
+                kind, index = self.pending_calls.pop(reference)
                 try:
                     self._take(kind, index, ray.get(reference))
                     self.last_replies[index] = time.monotonic()
@@ -216,7 +216,7 @@ class DrivenGang:
         if now < self._next_beat or not self.actors:
             return
         self._next_beat = now + _BEAT
-        waiting = {index for kind, index in self.calls.values() if kind == "beat"}
+        waiting = {index for kind, index in self.pending_calls.values() if kind == "beat"}
         patience = _STARTING if self.phase == "starting" else LEASE
         for index, node in enumerate(self.nodes):
             if index not in waiting:
@@ -238,7 +238,7 @@ class DrivenGang:
             early = ("stopped before it was started", Cause.STOPPED)
             self.end(index, None, *(("", None) if node["started"] else early))
         self._kill_actors()
-        self.actors, self.calls, self.phase = [], {}, "stopped"
+        self.actors, self.pending_calls, self.phase = [], {}, "stopped"
         self.folder.plan(self.name).unlink(missing_ok=True)
 
     def _kill_actors(self) -> None:

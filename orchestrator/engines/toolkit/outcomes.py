@@ -44,7 +44,7 @@ def seen(handle: Handle, index: int, code: int, reason: str, at: float, requeste
         code: Its exit code.
         reason: What the engine says of it; empty: what the exit code says.
         at: When it ended [Unix s].
-        asked: Whether it ended because others did.
+        requested: Whether it ended because others did.
     """
     words = reason or (f"container exited with code {code}" if code else "done")
     return Outcome(index, handle.facts["epoch"], code, None, words, None, at, at, requested)

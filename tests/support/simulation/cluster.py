@@ -180,7 +180,7 @@ class Cluster:
     ) -> None:
         """The node ends: it writes its outcome until that stands, or leaves without one after a while.
 
-        ``asked``: whether it was asked to end when its work ended; None: as it is now. ``fault``: whether the job's own fault ends it.
+        ``requested``: whether it was asked to end when its work ended; None: as it is now. ``fault``: whether the job's own fault ends it.
         """
         if not node.alive:
             return

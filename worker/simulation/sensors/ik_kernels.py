@@ -18,7 +18,7 @@ class IkArrays:
     """Wanted motion of a frame in the coming control step, one row per world.
 
     Attributes:
-        wanted: Displacement along and turn about the axes [m, rad]; where the declaration is ``absolute``, position and orientation
+        target: Displacement along and turn about the axes [m, rad]; where the declaration is ``absolute``, position and orientation
             [m, quaternion xyzw of any length]. Shape ``(worlds, columns)``; a column for each of the declared ``axes``. The joints'
             targets are computed from it after all actions are written; then it is reset to 0.
     """
@@ -36,7 +36,7 @@ class Chain:
         absolute: Whether positions and orientations are wanted, not displacements.
         turn: First column of the wanted quaternion, -1 where there is none.
         rows: Index of each equation in ``AXES``, shape ``(equations,)``.
-        columns: Column of ``IkArrays.wanted`` for each equation, shape ``(equations,)``; unused for a quaternion.
+        columns: Column of ``IkArrays.target`` for each equation, shape ``(equations,)``; unused for a quaternion.
         weights: Squared weight of each equation, shape ``(equations,)``.
         children: Columns of the bodies that the joints move, shape ``(joints,)``.
         slides: 1 for sliding joints, 0 for hinges, shape ``(joints,)``.
@@ -95,7 +95,7 @@ def _movement(chain: Chain, bodies: BodyArrays, world: int, joint: int, position
 
 @wp.func
 def _turn_to(here: wp.quat, target: wp.quat) -> wp.vec3:
-    """Rotation vector, the shorter way, from one orientation to another [rad]; none where ``wanted`` has no length."""
+    """Rotation vector, the shorter way, from one orientation to another [rad]; none where ``target`` has no length."""
     if wp.length(target) < 1.0e-6:
         return wp.vec3(0.0, 0.0, 0.0)
     between = wp.normalize(target) * wp.quat_inverse(here)

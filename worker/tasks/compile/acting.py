@@ -21,10 +21,10 @@ def frame_of(bound: Bound, sensors: Mapping[str, Any]) -> DifferentialIK | None:
 
 def _frames(bound: Bound, sensors: Mapping[str, Any]) -> Iterator[str]:
     """Names of a term's inverse kinematics."""
-    supplied = {
+    read_sensors = {
         variable.removeprefix("sensor_") for variable in bound.arguments.values() if variable.startswith("sensor_")
     }
-    yield from (name for name, sensor in sensors.items() if name in supplied and isinstance(sensor, DifferentialIK))
+    yield from (name for name, sensor in sensors.items() if name in read_sensors and isinstance(sensor, DifferentialIK))
 
 
 TAKING: Mapping[Input, tuple[str, str, str]] = {
@@ -113,11 +113,11 @@ def check_driven(acting: Sequence[Bound], views: Mapping[str, RobotView], sensor
         what = "joint" if any(bound.takes("joint") and doubled in bound.element_names for bound in acting) else "column"
         raise ValueError(f"actions: {what} {doubled} is driven by two terms; each {what} has one action")
     driven = {(bound.term.robot, joint) for bound in acting if bound.takes("joint") for joint in bound.elements or ()}
-    requested = {name for bound in acting for name in _frames(bound, sensors)}
+    moved_frames = {name for bound in acting for name in _frames(bound, sensors)}
     for name, sensor in sensors.items():
         if not isinstance(sensor, DifferentialIK):
             continue
-        if name not in requested:
+        if name not in moved_frames:
             raise ValueError(f"sensors.{name}: no action asks for it; declare one, such as Action(terms.move_frame)")
         view = views[sensor.robot]
         for joint in sensor.driven(views):

@@ -36,7 +36,7 @@ from worker.simulation.worlds import WorldArrays
 Element = Literal["joint", "body", "site", "index", "action"]
 ELEMENTS: tuple[Element, ...] = ("joint", "body", "site", "index", "action")
 """Parameters over whose values a function is called."""
-SUPPLIED = ("world", "stream", "memory", "lasting", "value", "choice", "terminated", "seconds")
+FILLED = ("world", "stream", "memory", "lasting", "value", "choice", "terminated", "seconds")
 """Parameters that the compiler fills by their names."""
 WIDTHS: Mapping[Any, int] = {
     float: 1,
@@ -84,7 +84,7 @@ class Signature:
         return {
             name: kind
             for name, kind in self.parameters.items()
-            if kind in WIDTHS and name not in (*SUPPLIED, *ELEMENTS, "command", *taken)
+            if kind in WIDTHS and name not in (*FILLED, *ELEMENTS, "command", *taken)
         }
 
 

@@ -38,7 +38,7 @@ class Adapting:
     def read(self) -> None:
         """Take the steps from :attr:`state`, at the start and after a load, and set the numbers."""
         started, *steps = self.state[0].tolist()
-        self._started, self._steps = int(started), steps
+        self._last_iteration, self._steps = int(started), steps
         self._write()
 
     @property
@@ -53,9 +53,9 @@ class Adapting:
             iteration: The checkpoint's last.
             steps: As :attr:`steps`; a rule that it lacks is at its start.
         """
-        self._started = max(self._started, iteration)
-        supplied = zip(self._names, self._rules, strict=True)
-        self._steps = [min(max(float(steps.get(name, 0.0)), 0.0), float(rule.steps)) for name, rule in supplied]
+        self._last_iteration = max(self._last_iteration, iteration)
+        rules = zip(self._names, self._rules, strict=True)
+        self._steps = [min(max(float(steps.get(name, 0.0)), 0.0), float(rule.steps)) for name, rule in rules]
         self._write()
 
     def begin(self, iteration: int, reward: float | None, episode_length: float | None) -> None:
@@ -66,9 +66,9 @@ class Adapting:
             reward: Mean return of the episodes that ended last; None before the first.
             episode_length: Their mean length [steps].
         """
-        if iteration <= self._started or not self._rules:
+        if iteration <= self._last_iteration or not self._rules:
             return
-        self._started = iteration
+        self._last_iteration = iteration
         pairs = zip(self._rules, self._steps, strict=True)
         self._steps = [rule.after(step, reward, episode_length) for rule, step in pairs]
         self._write()
@@ -76,7 +76,7 @@ class Adapting:
     def _write(self) -> None:
         for rule, step in zip(self._rules, self._steps, strict=True):
             self._number(rule.place).fill_(rule.value(step))
-        self.state[:] = torch.tensor([float(self._started), *self._steps])
+        self.state[:] = torch.tensor([float(self._last_iteration), *self._steps])
 
 
 def adaptive_steps(task: Task) -> dict[str, float]:

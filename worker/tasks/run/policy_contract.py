@@ -64,12 +64,12 @@ def robots_of(task: Task) -> tuple[RobotModel, ...]:
     return tuple(dataclasses.replace(reading.identity, name=name) for name, reading in task.readings.items())
 
 
-def _group(task: Task, name: str, supplied: str, shape: tuple[int, ...]) -> Group:
+def _group(task: Task, name: str, input_name: str, shape: tuple[int, ...]) -> Group:
     if len(shape) > 1:
-        return Group(name, supplied, shape, "uint8", image=_image(task, name))
+        return Group(name, input_name, shape, "uint8", image=_image(task, name))
     terms = _terms(task, name)
     fits = sum(term.size for term in terms) == shape[0]
-    return Group(name, supplied, shape, "float32", terms=terms if fits else ())
+    return Group(name, input_name, shape, "float32", terms=terms if fits else ())
 
 
 def _image(task: Task, group: str) -> Image | None:
@@ -168,9 +168,9 @@ def images_of(task: Task) -> dict[str, dict[str, Any]]:
     """Description of each image group, as plain values: the camera's settings, and the names of the channels."""
     plan, found = task.plan, {}
     for group, name in plan.images.items():
-        sensor, supplied = plan.declaration.sensors[name], getattr(task.config, name, None)
+        sensor, setting = plan.declaration.sensors[name], getattr(task.config, name, None)
         # a camera of the configuration is described by its settings alone
-        settings = {} if isinstance(supplied, CameraConfig) else {"sensor": name}
-        described = dataclasses.asdict(supplied if isinstance(supplied, CameraConfig) else sensor)
+        settings = {} if isinstance(setting, CameraConfig) else {"sensor": name}
+        described = dataclasses.asdict(setting if isinstance(setting, CameraConfig) else sensor)
         found[group] = {**settings, **described, "channels": sensor.rows(plan.views)}
     return found
