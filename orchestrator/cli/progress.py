@@ -6,7 +6,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -60,6 +60,19 @@ def follow(client: Client, job_id: str) -> int:
                 break
             time.sleep(_POLL)
     return summary(client, job_id)
+
+
+@contextmanager
+def following(job_id: str) -> Iterator[None]:
+    """A block that follows a job. Where the controller refuses its requests from now on, the error says that the job continues."""
+    try:
+        yield
+    except ApiError as error:
+        if error.status != 403:
+            raise
+        short = reasons.short_id(job_id)
+        words = f"job {short} continues, but the controller refuses to show it: {error}; then: muster logs {short} -f"
+        raise ApiError(words, error.status) from None
 
 
 def _cause(attempt: Mapping[str, Any]) -> dict[str, Any] | None:

@@ -68,7 +68,7 @@ def _algorithm_name(value: str) -> str:
     known = list(ALGORITHMS)
     if value in known or re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", value):
         return value
-    hint = nearest(value, known, f"there are {', '.join(known)}, and module:Class of your own")
+    hint = nearest(value, known, f"available: {', '.join(known)}, or your own as module:Class")
     raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
 
 

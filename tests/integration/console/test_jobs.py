@@ -219,7 +219,7 @@ def test_a_key_sees_its_queues_alone(console: Console, waiting: dict[str, str]) 
     with Client(console.url, console.secrets["lab"]) as client:
         assert [each["name"] for each in client.get("/api/queues")["queues"]] == ["lab"]
     refused = console.visitor("lab").page("/queues?queue=shared", 404)
-    assert "there is no queue 'shared'; there is lab" in refused.text
+    assert "Job queue shared does not exist; available: lab" in refused.text
 
 
 def test_one_stream_renews_all_tables(console: Console, waiting: dict[str, str]) -> None:

@@ -133,7 +133,7 @@ FILES: dict[str, str] = {
         f":2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class; {OF_PLUGIN})"
     ),
     "name: a\ntrain: {task: zzz, worlds: 4, iterations: 2}\n": (
-        f":2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class; {OF_PLUGIN})"
+        f":2: train.task: no task is called 'zzz'; available: {TASKS} (your own: module:Class; {OF_PLUGIN})"
     ),
     "name: a\nevaluate: {run: ../x}\n": f":2: evaluate.run: {RUN_LETTERS}, found '../x'",
     "name: a\nexport: {run: x, checkpoint: new}\n": (
