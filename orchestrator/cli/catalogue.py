@@ -166,7 +166,7 @@ def _use_server(ctx: typer.Context, url: str | None) -> str | None:
     if url is not None:
         if not url.startswith(("http://", "https://")):
             near = f"http://{url}" if re.fullmatch(r"[\w.:\[\]-]+", url) else "http://127.0.0.1:8080"
-            raise UsageError(f"--server {url}: expected the URL of a controller, such as {near}")
+            raise UsageError(f"--server{url and f' {url}'}: expected the URL of a controller, such as {near}")
         os.environ["MUSTER_URL"] = ctx.meta[_SERVER] = url
     return url
 

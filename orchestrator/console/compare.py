@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import partial
+from itertools import groupby
 from typing import Any
 from urllib.parse import quote, urlencode
 
@@ -69,7 +70,7 @@ def compare(
         differences=[(sentence(each), each["verdict"]) for each in differences if each],
         first=first.label if first else "",
         patterns=" ".join(runs),
-        metrics=metrics,
+        metrics=[(name, list(names)) for name, names in groupby(metrics, _prefix)],
         metric=metric or "reward",
         curves=f"/compare/curves?{urlencode([('run', name) for name in names])}",
     )
@@ -140,4 +141,10 @@ def _facts(request: Request, name: str) -> ComparedRun:
 def _metrics(groups: Sequence[RunGroup]) -> list[str]:
     """The metrics for which at least one run has a number."""
     newest = [run.records[-1] for group in groups for run in group.runs if run.records]
-    return sorted({name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS)
+    names = {name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS
+    return sorted(names, key=lambda name: ("/" in name, name))
+
+
+def _prefix(metric: str) -> str:
+    """Under which heading the page lists a metric."""
+    return metric.rpartition("/")[0] or "training"

@@ -99,7 +99,8 @@ def test_keys_come_and_go_without_a_restart_and_deleting_the_last_one_opens_noth
         assert "deleted key a\nthis was the last key" in done.stdout, done.stdout
         assert "its own user's requests on loopback" in done.stdout and "does not start without a key" in done.stdout
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
-        assert "no key is left: on the controller's machine" in call_muster("list", home=tmp_path).stderr
+        left = "no key is left: on the controller's machine"
+        wait_for(lambda: left in call_muster("list", home=tmp_path).stderr, what="the server's look at the keys")
         for each in (other, key):
             bearer = {"Authorization": f"Bearer {each.access_key_id}:{each.secret}"}
             wait_for(lambda sent=bearer: httpx.get(f"{server.url}/api/runs", headers=sent).status_code == 403)
