@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import partial
-from itertools import groupby
 from typing import Any
 from urllib.parse import quote, urlencode
 
@@ -70,7 +70,7 @@ def compare(
         differences=[(sentence(each), each["verdict"]) for each in differences if each],
         first=first.label if first else "",
         patterns=" ".join(runs),
-        metrics=[(name, list(names)) for name, names in groupby(metrics, _prefix)],
+        metrics=_by_prefix(metrics),
         metric=metric or "reward",
         curves=f"/compare/curves?{urlencode([('run', name) for name in names])}",
     )
@@ -141,10 +141,13 @@ def _facts(request: Request, name: str) -> ComparedRun:
 def _metrics(groups: Sequence[RunGroup]) -> list[str]:
     """The metrics for which at least one run has a number."""
     newest = [run.records[-1] for group in groups for run in group.runs if run.records]
-    names = {name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS
-    return sorted(names, key=lambda name: ("/" in name, name))
+    return sorted({name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS)
 
 
-def _prefix(metric: str) -> str:
-    """Under which heading the page lists a metric."""
-    return metric.rpartition("/")[0] or "training"
+def _by_prefix(metrics: Sequence[str]) -> dict[str, list[str]]:
+    """The metrics by what their names have before the first underscore; those that share it with no other one are the last group."""
+    prefixes = {name: name.partition("_")[0] for name in metrics}
+    counts, found = Counter(prefixes.values()), defaultdict[str, list[str]](list)
+    for name in sorted(metrics, key=lambda name: (counts[prefixes[name]] == 1, name)):
+        found[prefixes[name] if counts[prefixes[name]] > 1 else "other"].append(name)
+    return found

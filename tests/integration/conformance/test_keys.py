@@ -89,6 +89,9 @@ def test_keys_come_and_go_without_a_restart_and_deleting_the_last_one_opens_noth
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
         again = call_muster("list", home=tmp_path)
         assert again.returncode == 1 and "`muster keys list` shows the keys" in again.stderr
+        assert call_muster("keys", "create", "c", home=tmp_path / "other").stdout.startswith(
+            "from now on everybody needs"
+        )
         made = call_muster("keys", "create", "b", "--queue", "robots", "--queue", "default", home=tmp_path)
         other = next(each for each in store.load().values() if each.name == "b")
         assert other.queues == ("robots", "default") and made.returncode == 0, made.stderr

@@ -41,6 +41,7 @@ def many(console: Console, definition: str) -> list[str]:
 
 
 def test_the_newest_jobs_come_first_a_page_at_a_time(visitor: Visitor, many: list[str]) -> None:
+    assert visitor.http.get("/jobs", follow_redirects=False).headers["location"] == "/"
     first = visitor.page("/")
     assert names(first) == [f"job-{i}" for i in range(119, 69, -1)]
     assert "50 of 120" in first.text and not first.all("a", rel="prev")

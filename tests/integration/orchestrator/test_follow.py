@@ -56,17 +56,6 @@ def test_a_follower_waits_for_the_service_and_does_not_take_its_place(
     assert [line for line in lines if "STARTING" not in line] == [complaint]
 
 
-def test_a_follower_without_a_key_ends_once_there_are_keys_and_the_job_continues(
-    server: Serving, follower: subprocess.Popen[bytes], tmp_path: Path
-) -> None:
-    job = running(server)
-    made = server.muster("keys", "create", "ann")
-    assert made.stdout.startswith("from now on everybody needs a token"), made.stdout
-    assert follower.wait(60) == 1
-    line = (tmp_path / "errors").read_text().splitlines()[-1]
-    assert f"job {job[:8]} continues, but" in line and line.endswith(f"then: muster logs {job[:8]} -f")
-
-
 def test_without_the_store_jobs_are_listed_shown_and_stopped_and_who_follows_one_waits(
     server: Serving, follower: subprocess.Popen[bytes], tmp_path: Path
 ) -> None:

@@ -85,7 +85,7 @@ def test_jobs_are_listed_by_state_name_run_age_and_owner_and_stopped_together(la
     assert (
         names("--run", lab.detail(jobs[2])["run"]) == {"sheep"} == names("--name", "sheep", "--mine", "--since", "1h")
     )
-    assert names("--since", "0s") == set() and "no job fits" in lab.muster("list", "--run", "nowhere").stdout
+    assert names("--since", "0s") == set() and "no job fits" in lab.muster("list", "--name", "nowhere").stdout
     header, row = lab.muster("list", "--name", "sheep").stdout.splitlines()
     assert row[header.index("RUN ") :].split()[0] == lab.detail(jobs[2])["run"]
     stopped = printed(lab, "stop", "wolf-1", "wolf-2", "--reason", "enough")

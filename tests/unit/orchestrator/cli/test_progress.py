@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.cli.progress import _Bar, _Lines
+from orchestrator.cli.progress import _Bar, _Lines, following
+from orchestrator.domain.errors import ApiError
 
 DETAIL: dict[str, Any] = {
     "spec": {"train": {"iterations": 9}},
@@ -82,3 +83,13 @@ def test_the_bar_shows_the_phase_and_for_how_long_unless_iterations_come(monkeyp
     assert (
         text({**running(None), "status": "RUNNABLE", "statusReason": "waits for job a"}) == "RUNNABLE: waits for job a"
     )
+
+
+def test_a_follower_that_the_controller_refuses_from_now_on_learns_that_the_job_continues() -> None:
+    with (
+        pytest.raises(
+            ApiError, match=r"^job 00000000 continues, but .*: a token is needed; then: muster logs 00000000 -f$"
+        ),
+        following(DETAIL["id"]),
+    ):
+        raise ApiError("a token is needed", 403)
