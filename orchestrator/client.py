@@ -59,7 +59,9 @@ class Client:
     def __init__(self, url: str, token: str | None = None, socket: Path | None = None) -> None:
         """Raises NoUrl where ``url`` is malformed. ``socket``: a Unix socket of the controller, which is used in place of TCP."""
         if not _is_url(url):
-            raise NoUrl(f"{url!r} is not the URL of a controller; set MUSTER_URL to one such as {EXAMPLE_URL}")
+            raise NoUrl(
+                f"{url!r} is not the URL of a controller; set --server or MUSTER_URL to one such as {EXAMPLE_URL}"
+            )
         self.url = url
         self.found = False
         """Whether it is the running controller of the home directory, which no URL named."""
@@ -246,7 +248,8 @@ class Client:
             message = answer.json()["message"]
         except (ValueError, KeyError, TypeError):
             message = f"{answer.request.url} answered {answer.status_code}; is that a Muster controller?"
-        raise (NotServing if answer.status_code == 503 else ApiError)(message, answer.status_code)
+        is_absent = answer.status_code in (502, 503, 504)  # 502 and 504: of a proxy without its controller
+        raise (NotServing if is_absent else ApiError)(message, answer.status_code)
 
     def _unreachable(self, error: httpx.HTTPError) -> Unreachable:
         return Unreachable(

@@ -71,13 +71,19 @@ def local_url() -> str | None:
 
 
 def local_socket(home: Path) -> Path | None:
-    """The Unix socket of a home directory's controller, where that is the present user's."""
+    """The Unix socket of a home directory's controller, where no other user could have put it there."""
     path = home / SOCKET
     with suppress(OSError):
         found = path.lstat()
-        if stat.S_ISSOCK(found.st_mode) and found.st_uid == os.geteuid():
+        if stat.S_ISSOCK(found.st_mode) and found.st_uid == os.geteuid() and _is_own(home):
             return path
     return None
+
+
+def _is_own(home: Path) -> bool:
+    """Whether only the present user can replace files of this directory. Raises OSError."""
+    found = home.stat()
+    return found.st_uid == os.geteuid() and not found.st_mode & 0o022
 
 
 def open_socket(home: Path) -> socket.socket | None:
@@ -90,8 +96,7 @@ def open_socket(home: Path) -> socket.socket | None:
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.unlink(missing_ok=True)
-        found = home.stat()
-        if found.st_uid == os.geteuid() and not found.st_mode & 0o022:
+        if _is_own(home):
             listener.bind(str(path))
             path.chmod(0o600)  # nobody can connect before it listens
             listener.listen(128)

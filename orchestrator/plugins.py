@@ -32,7 +32,7 @@ def add_plugins(app: FastAPI) -> None:
         for operation in plugin.operations:
             if operation not in served:
                 raise PluginError(
-                    f"plug-in {name}: operations: no route of it serves {operation}; there are {_list(served)}"
+                    f"plug-in {name}: operations: no route of it serves {operation}; available: {_list(served)}"
                 )
         for label, path in plugin.navigation:
             if f"GET {path}" not in served:

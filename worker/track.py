@@ -254,7 +254,7 @@ def afterwards(directory: str, kind: str) -> int:
     if not described or "train" not in spec:
         return _fail(f"{run.path} is not a run that a `train` job made; name a directory of runs/ in the store")
     if kind not in SERVICES:
-        return _fail(f"no service is called {kind}; there are: {', '.join(SERVICES)}")
+        return _fail(f"no service is called {kind}; available: {', '.join(SERVICES)}")
     service = SERVICES[kind](tracked_of(run, spec["train"], {}), (spec.get("track") or {}).get(kind) or {})
     try:
         service.prepare()

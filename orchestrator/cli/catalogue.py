@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import os
+import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -163,8 +164,9 @@ def _members(group: TyperInfo) -> Iterator[CommandInfo | TyperInfo]:
 
 def _use_server(ctx: typer.Context, url: str | None) -> str | None:
     if url is not None:
-        if not url.strip():
-            raise UsageError("--server: give the URL of a controller, such as http://127.0.0.1:8080")
+        if not url.startswith(("http://", "https://")):
+            near = f"http://{url}" if re.fullmatch(r"[\w.:\[\]-]+", url) else "http://127.0.0.1:8080"
+            raise UsageError(f"--server{url and f' {url}'}: expected the URL of a controller, such as {near}")
         os.environ["MUSTER_URL"] = ctx.meta[_SERVER] = url
     return url
 

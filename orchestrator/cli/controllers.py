@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from orchestrator.cli.progress import follow
+from orchestrator.cli.progress import follow, following
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.domain.errors import NotServing, ServerError, Unreachable
@@ -19,7 +19,8 @@ def see_through(client: Client, job: str, follow: Callable[[Client, str], int] =
     """Follow a job to its end; Ctrl-C and SIGTERM stop it after a checkpoint. Returns the command's exit code."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        return follow(client, job)
+        with following(job):
+            return follow(client, job)
     except KeyboardInterrupt:
         echo("\nstopping: the job checkpoints and exits (Ctrl-C again: leave it running)", err=True)
         client.batch("TerminateJob", jobId=job, reason="stopped with Ctrl-C")

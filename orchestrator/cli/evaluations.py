@@ -11,9 +11,9 @@ import typer
 
 from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import controller
-from orchestrator.cli.progress import summary
+from orchestrator.cli.progress import follow_main
 from orchestrator.cli.submitting import carry_out, note, queue_change, store_of
-from orchestrator.cli.terminal import echo, echo_json
+from orchestrator.cli.terminal import echo_json
 from orchestrator.client import Client, named
 from orchestrator.spec.changes import override
 from orchestrator.spec.evaluations import evaluation_document
@@ -132,7 +132,7 @@ def follow_evaluation(
         elsewhere = queue_change(client, changes, queue, engine)
         spec = _spec(client, named(run), kind, name, section, [*worlds, *elsewhere])
         modes = {"follows": follow, "dry_run": dry_run, "as_json": as_json}
-        code, job = carry_out(client, spec, f"evaluate {source}", _printed, **modes)
+        code, job = carry_out(client, spec, f"evaluate {source}", follow_main, **modes)
         if job and code == 0 and (as_json or then):
             found = client.get(f"/api/runs/{named(run)}/evaluations")
             result = next(each for each in found if each.get("job") == job)
@@ -160,11 +160,3 @@ def _spec(
         text_of=partial(client.run_text, run),
     )
     return validate(whole, source)
-
-
-def _printed(client: Client, job: str) -> int:
-    """Print the main rank's output, and how the job ended if it did not succeed. Returns the exit code."""
-    for line in client.logs(job, follow=True):
-        if line["rank"] == 0:
-            echo(line["text"])
-    return 0 if client.get(f"/api/jobs/{job}")["status"] == "SUCCEEDED" else summary(client, job)

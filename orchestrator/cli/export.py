@@ -10,7 +10,7 @@ import typer
 from orchestrator.cli import command_options as options
 from orchestrator.cli.controllers import controller, see_through
 from orchestrator.cli.listings import show_facts
-from orchestrator.cli.progress import await_end, follow
+from orchestrator.cli.progress import await_end, follow_main
 from orchestrator.cli.runs import chosen
 from orchestrator.cli.submitting import submit_spec
 from orchestrator.cli.terminal import echo, echo_json
@@ -60,7 +60,7 @@ def export(
         document = {"name": f"export-{run}"[:128], "resources": {"cpus": 1, "memory": "2GiB"}, "export": section}
         spec = validate(override(document, set_ or []), "muster export")
         job = submit_spec(client, spec, "muster export")["jobId"]
-        code = see_through(client, job, await_end if as_json else follow)
+        code = see_through(client, job, await_end if as_json else follow_main)
         if code == 0:
             place = Store(client.get("/api/capacity")["store"]).run(run).exports / checkpoint["name"]
             facts = _checks(place, output)

@@ -56,17 +56,17 @@ def gc(
     with Client.connect() as client:
         found = [each for part in _parts(client, dry_run, older_than or "") for each in part]
     gone, kept = [each for each in found if each["jobs"]], [each for each in found if each["kept"]]
+    jobs, runs = sum(len(each["jobs"]) for each in gone), sum(each["whole"] for each in gone)
+    size, files = sum(each["bytes"] for each in gone), sum(each["files"] for each in gone)
     if as_json:
-        echo_json({"taken": not dry_run, "runs": found}, indent=1)
+        counts = {"jobs": jobs, "runs": runs, "files": files, "bytes": size, "kept": len(kept)}
+        echo_json({"taken": not dry_run, "counts": counts, "runs": found}, indent=1)
         return
     if dry_run and gone:
         GONE.show(gone)
     for reasons, runs_kept in _by_reasons(kept).items():
         echo(f"kept: {'run' if len(runs_kept) == 1 else 'runs'} {', '.join(runs_kept)}: {reasons}")
-    jobs, runs = sum(len(each["jobs"]) for each in gone), sum(each["whole"] for each in gone)
-    size = sum(each["bytes"] for each in gone)
-    files = counted(sum(each["files"] for each in gone), "file")
-    what = f"{counted(jobs, 'job')} and {counted(runs, 'run')}: {files}, {mebibytes(size)}"
+    what = f"{counted(jobs, 'job')} and {counted(runs, 'run')}: {counted(files, 'file')}, {mebibytes(size)}"
     echo(f"would delete {what}" if dry_run else f"deleted {what}")
     if not found:
         echo("no job of yours is old enough by the rule of its queue; `muster gc --help` says which rules there are")

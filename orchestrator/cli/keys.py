@@ -66,14 +66,22 @@ def create(
     database: DatabaseOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Create a key and show it once. From now on the server admits only callers with a key or MUSTER_TOKEN."""
+    """Create a key and show it once.
+
+    From the first key on everybody needs a token: also the controller's own user, and also on the Unix socket.
+    """
     with opened(muster_home(), database) as keys:
+        is_first = keys.is_empty
         key = keys.create(name, queue, read_only, share)
     if as_json:
         echo_json({**key.describe(), "secretAccessKey": key.secret})
         return
     running = published(muster_home())
     url, region = (running.url, running.region) if running else (EXAMPLE_URL, "us-east-1")
+    if is_first:
+        echo(
+            "from now on everybody needs a token for this controller: also its own user, and also on the Unix socket\n"
+        )
     echo(
         f"""created key {key.name} ({key.rights}, share {key.share}); its secret is shown only this once
 
@@ -86,7 +94,7 @@ AWS command, for `aws --profile {key.name} batch …` (boto3: boto3.Session(prof
 muster, and 'Authorization: Bearer …' elsewhere:
   export MUSTER_TOKEN={key.access_key_id}:{key.secret}
 
-The server of {muster_home()} demands a key from now on; a running one sees this one within a second."""
+A running controller accepts the key within a second."""
     )
 
 

@@ -15,7 +15,8 @@ from orchestrator.cli.progress import log_lines
 from orchestrator.cli.terminal import echo, echo_raw, to_json, visible
 from orchestrator.client import Client, named
 from orchestrator.domain import reasons
-from orchestrator.domain.errors import SpecError
+from orchestrator.domain.errors import SpecError, UsageError
+from shared_store.contract.error_text import counted
 
 _COLOURS = (36, 33, 35, 32, 34, 31)
 """ANSI colours of the node prefixes, by node index."""
@@ -30,9 +31,9 @@ def register(app: typer.Typer) -> None:
 def logs(
     job: JobArgument,
     follow: Annotated[bool, typer.Option("--follow", "-f", help="Follow the log until the job ends.")] = False,
-    node: Annotated[int | None, typer.Option(help="Only this node.")] = None,
-    rank: Annotated[int | None, typer.Option(help="Only this rank.")] = None,
-    attempt: Annotated[int | None, typer.Option(help="Only this attempt.")] = None,
+    node: Annotated[int | None, typer.Option(min=0, help="Only this node.")] = None,
+    rank: Annotated[int | None, typer.Option(min=0, help="Only this rank.")] = None,
+    attempt: Annotated[int | None, typer.Option(min=1, help="Only this attempt.")] = None,
     since: SinceOption = None,
     grep: Annotated[
         str | None, typer.Option(metavar="REGEX", help="Print only lines that match this regular expression.")
@@ -52,6 +53,7 @@ def logs(
         raise SpecError(f"--grep {grep}: not a regular expression ({error})") from None
     colour, is_empty = sys.stdout.isatty(), True
     with Client.connect() as client:
+        _check_nodes(client, job, node=node, rank=rank)
         batches = log_lines(client, job, follow=follow, node=node, rank=rank, attempt=attempt)
         hint = _children_hint(client, job) if follow else ""
         if hint:
@@ -71,6 +73,16 @@ def logs(
             reason = _why_empty(client, job, part)
             if reason != hint:
                 echo(reason, err=True)
+
+
+def _check_nodes(client: Client, job: str, **options: int | None) -> None:
+    """Raises UsageError where an option exceeds the nodes of the job, ApiError, Unreachable."""
+    for name, value in options.items():
+        if value:
+            detail = client.get(f"/api/jobs/{named(job)}", store=False)
+            nodes = max(int(detail["nodes"]), *(len(attempt["nodes"]) for attempt in detail["attempts"]), 1)
+            if value >= nodes:
+                raise UsageError(f"--{name} {value}: job {job} has {counted(nodes, 'node')}, numbered from 0")
 
 
 def _why_empty(client: Client, job: str, part: str) -> str:

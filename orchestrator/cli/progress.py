@@ -6,7 +6,7 @@ import re
 import sys
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
@@ -23,6 +23,8 @@ from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.metrics import warnings_of
 
 _POLL = 0.3
+_OF_LIBRARIES = re.compile(r'\{"|(?:DEBUG|INFO|WARNING|ERROR):[\w.]+:|\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d')
+"""Beginning of a line that a library logs: JSON, or Python's logging."""
 _PLAIN_INTERVAL = 2.0
 """Seconds between two plain lines of progress."""
 
@@ -60,6 +62,28 @@ def follow(client: Client, job_id: str) -> int:
                 break
             time.sleep(_POLL)
     return summary(client, job_id)
+
+
+@contextmanager
+def following(job_id: str) -> Iterator[None]:
+    """A block that follows a job. Where the controller refuses its requests from now on, the error says that the job continues."""
+    try:
+        yield
+    except ApiError as error:
+        if error.status != 403:
+            raise
+        short = reasons.short_id(job_id)
+        words = f"job {short} continues, but the controller refuses to show it: {error}; then: muster logs {short} -f"
+        raise ApiError(words, error.status) from None
+
+
+def follow_main(client: Client, job_id: str) -> int:
+    """Print the main rank's output until a job ends, and how it ended if it did not succeed; returns the command's exit code."""
+    for lines in log_lines(client, job_id, follow=True):
+        for line in lines:
+            if line["rank"] == 0 and not _OF_LIBRARIES.match(line["text"]):
+                echo(line["text"])
+    return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id)
 
 
 def _cause(attempt: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -235,6 +259,8 @@ class _Display:
             self.iteration = self.iteration if len(attempts) == self._attempt else 0
             self._attempt = len(attempts)
         phase = phase_in(job)
+        if phase and phase.is_before_training and self.iteration:
+            phase = None  # the metrics are newer than the node's report
         text = phase.words if phase else "" if self.iteration else "loading libraries"
         text = text if job["status"] == "RUNNING" else ""
         if text == self._phase:

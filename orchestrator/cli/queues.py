@@ -81,19 +81,19 @@ def show(
 ) -> None:
     """Show a queue's waiting jobs in the order in which they will start, and why each waits."""
     with Client.connect() as client:
-        found = client.batch("DescribeJobQueues", jobQueues=[name])["jobQueues"]
-        if not found:
-            client.batch("GetJobQueueSnapshot", jobQueue=name)  # refuses an unknown name with the existing ones
-        _take_snapshot(client, found[0], is_named=True)
+        queue = _described(client, name)
+        _take_snapshot(client, queue, is_named=True)
         front = client.get("/api/queues", queue=name)["queues"][0]["front"]
-    QUEUES.show(found, as_json)
+    QUEUES.show([queue], as_json)
     if not as_json:
         _FRONT.show([{**job, "next": number} for number, job in enumerate(front, 1)])
 
 
 def create(
     name: Annotated[str, typer.Argument(help="Name of the queue.")],
-    priority: Annotated[int, typer.Option(help="Jobs of a queue with a higher priority start first.")] = 1,
+    priority: Annotated[
+        int, typer.Option(min=0, max=1_000_000, help="Jobs of a queue with a higher priority start first.")
+    ] = 1,
     like: Annotated[
         str | None,
         typer.Option(metavar="QUEUE", help="Use the compute environments of this queue."),
@@ -108,15 +108,23 @@ def create(
         raise UsageError("--like and --engine: an engine means its queue; leave one of them out")
     with Client.connect() as client:
         source = like or (engine_queue(client, engine) if engine else "default")
-        found = client.batch("DescribeJobQueues", jobQueues=[source])["jobQueues"]
-        if not found:
-            client.batch("GetJobQueueSnapshot", jobQueue=source)
-        order = found[0]["computeEnvironmentOrder"]
-        made = client.batch("CreateJobQueue", jobQueueName=name, priority=priority, computeEnvironmentOrder=order)
+        try:
+            order = _described(client, source)["computeEnvironmentOrder"]
+            made = client.batch("CreateJobQueue", jobQueueName=name, priority=priority, computeEnvironmentOrder=order)
+        except ApiError as error:
+            raise ApiError(str(error).replace("jobQueueName", "NAME"), error.status) from None
     if as_json:
         echo_json(made)
     else:
         echo(f"created queue {name} with priority {priority}; use it with: muster submit SPEC --queue {name}")
+
+
+def _described(client: Client, name: str) -> dict[str, Any]:
+    """The description of a queue. Raises ApiError with the existing ones where there is none of this name."""
+    found = client.batch("DescribeJobQueues", jobQueues=[name])["jobQueues"]
+    if not found:
+        client.batch("GetJobQueueSnapshot", jobQueue=name)  # refuses an unknown name
+    return dict(found[0])
 
 
 def _take_snapshot(client: Client, queue: dict[str, Any], is_named: bool) -> bool:

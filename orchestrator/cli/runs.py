@@ -14,7 +14,7 @@ from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import UsageError
-from shared_store.contract.error_text import counted
+from shared_store.contract.error_text import counted, unknown_iteration
 
 _A_PAGE = 100
 
@@ -121,8 +121,9 @@ def delete(run: RunArgument, yes: YesOption = False, as_json: JsonOption = False
     a league. The jobs of the run stay in the history.
     """
     with Client.connect() as client:
+        found = client.get(f"/api/runs/{named(run)}")
         if not yes:
-            _confirm(client, run)
+            _confirm(found)
         deleted = client.delete(f"/api/runs/{named(run)}", seconds=610)
     if as_json:
         echo_json(deleted)
@@ -132,11 +133,11 @@ def delete(run: RunArgument, yes: YesOption = False, as_json: JsonOption = False
         echo(f"not all of them can be removed; remove the rest by hand: {left}")
 
 
-def _confirm(client: Client, run: str) -> None:
+def _confirm(found: dict[str, Any]) -> None:
     """Raises typer.Abort if the user does not confirm, UsageError where nobody can answer."""
+    run = found["run"]
     if not sys.stdin.isatty():
         raise UsageError(f"run {run} is not deleted: add --yes where nobody can answer")
-    found = client.get(f"/api/runs/{named(run)}")
     what = f"{counted(found['checkpoints'], 'checkpoint')} and everything else in it"
     typer.confirm(f"delete run {run} with {what} for good?", abort=True)
 
@@ -169,7 +170,7 @@ def _evaluated(summary: dict[str, Any] | None) -> str:
 
 
 def chosen(client: Client, run: str, reference: int | str | None) -> dict[str, Any]:
-    """The API's description of the referenced checkpoint. Raises UsageError with the nearest one."""
+    """The API's description of the referenced checkpoint. Raises UsageError with the available ones."""
     found: list[dict[str, Any]] = client.get(f"/api/runs/{named(run)}/checkpoints")
     if not found:
         raise UsageError(f"run {run} has no checkpoint yet; train it first")
@@ -182,9 +183,5 @@ def chosen(client: Client, run: str, reference: int | str | None) -> dict[str, A
         return best
     fitting = [each for each in found if each["iteration"] == reference]
     if not fitting:
-        iterations = [str(each["iteration"]) for each in found]
-        near = min(found, key=lambda each: abs(each["iteration"] - int(reference)))["iteration"]
-        raise UsageError(
-            f"run {run} has no checkpoint of iteration {reference}; the nearest is {near}; it has: {', '.join(iterations)}"
-        )
+        raise UsageError(unknown_iteration(run, reference, (each["iteration"] for each in found)))
     return fitting[-1]

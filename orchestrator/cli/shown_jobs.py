@@ -109,8 +109,8 @@ def list_jobs(
     literal = max(re.split(r"\[.*?\]|[*?]", name or ""), key=len)  # of the pattern, for the controller's search
 
     def fits(job: Mapping[str, Any]) -> bool:
-        named = name is None or fnmatchcase(job["name"], name)
-        return named and run in (None, job["run"]) and (job.get("isOwn", True) or not mine)
+        has_name = name is None or fnmatchcase(job["name"], name)
+        return has_name and run in (None, job["run"]) and (job.get("isOwn", True) or not mine)
 
     states = [each.upper() for each in state or ()]
     if wrong := [each for each in states if each not in set(Status)]:
@@ -118,6 +118,12 @@ def list_jobs(
     query = {"status": states or None, "queue": queue, "search": run or literal or None}
     with Client.connect() as client:
         jobs = _newest(client, query, fits, oldest, None if all_ else _NEWEST, automatic=as_json)
+        if (
+            run
+            and not jobs
+            and not _newest(client, {"search": run}, lambda job: job["run"] == run, 0, 1, automatic=True)
+        ):
+            client.get(f"/api/runs/{named(run)}")  # refuses an unknown one
     if as_json:
         echo_json(jobs if all_ else jobs[:_NEWEST], indent=1)
         return

@@ -15,7 +15,7 @@ import typer
 from orchestrator.cli.command_options import changes_of, check_engine
 from orchestrator.cli.controllers import see_through
 from orchestrator.cli.listings import Resource
-from orchestrator.cli.progress import await_end, follow
+from orchestrator.cli.progress import await_end, follow, following
 from orchestrator.cli.terminal import echo, echo_json, one_line
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, SpecError, Unavailable, Unreachable, UsageError
@@ -120,7 +120,8 @@ def report(client: Client, submitted: Mapping[str, Any], line: str, follows: boo
         if not follows:
             echo(f"follow it with: muster logs {submitted['jobId'][:8]} -f")
     if follows:
-        raise typer.Exit((await_end if as_json else follow)(client, submitted["jobId"]))
+        with following(submitted["jobId"]):
+            raise typer.Exit((await_end if as_json else follow)(client, submitted["jobId"]))
 
 
 def carry_out(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter, defaultdict
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
 from functools import partial
@@ -69,7 +70,7 @@ def compare(
         differences=[(sentence(each), each["verdict"]) for each in differences if each],
         first=first.label if first else "",
         patterns=" ".join(runs),
-        metrics=metrics,
+        metrics=_by_prefix(metrics),
         metric=metric or "reward",
         curves=f"/compare/curves?{urlencode([('run', name) for name in names])}",
     )
@@ -141,3 +142,12 @@ def _metrics(groups: Sequence[RunGroup]) -> list[str]:
     """The metrics for which at least one run has a number."""
     newest = [run.records[-1] for group in groups for run in group.runs if run.records]
     return sorted({name for each in newest for name, value in each.items() if number(value) is not None} - _NO_METRICS)
+
+
+def _by_prefix(metrics: Sequence[str]) -> dict[str, list[str]]:
+    """The metrics by what their names have before the first underscore; those that share it with no other one are the last group."""
+    prefixes = {name: name.partition("_")[0] for name in metrics}
+    counts, found = Counter(prefixes.values()), defaultdict[str, list[str]](list)
+    for name in sorted(metrics, key=lambda name: (counts[prefixes[name]] == 1, name)):
+        found[prefixes[name] if counts[prefixes[name]] > 1 else "other"].append(name)
+    return found

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from urllib.parse import urlencode
 
 from fastapi import Depends, Query, Request, Response
+from fastapi.responses import RedirectResponse
 
 from orchestrator.api.http.requests import actor_of, controller_of
 from orchestrator.api.native.job_list import JobSelection, ids_of, page_of_jobs
@@ -64,6 +65,12 @@ class _Choice:
 
 
 _Chosen = Annotated[_Choice, Depends()]
+
+
+@router.get("/jobs")
+def list_of_jobs() -> Response:
+    """The address under which the pages of jobs lie."""
+    return RedirectResponse("/", 303)
 
 
 @router.get("/")

@@ -22,8 +22,7 @@ from orchestrator.console.submit_fields import FieldGroup, document, filled, for
 from orchestrator.console.submit_help import SOURCE, SubmissionProblem, help_at, problem_of
 from orchestrator.domain.errors import ClientError, SpecError
 from orchestrator.services import permissions
-from orchestrator.services.context import queue_names
-from orchestrator.services.fit import UnknownQueue
+from orchestrator.services.context import UnknownQueue, queue_names
 from orchestrator.services.permissions import Operation
 from orchestrator.services.spec_submission import submit_spec
 from orchestrator.services.texts import with_texts

@@ -79,7 +79,10 @@ class Deliveries:
         for webhook in self.webhooks.values():
             for queue in sorted({*(webhook.queues or ())} - {*known}):
                 log.warning(
-                    "webhook %s: there is no queue %s now; %s", webhook.name, queue[:100], nearest(queue, sorted(known))
+                    "webhook %s: Job queue %s does not exist; %s",
+                    webhook.name,
+                    queue[:100],
+                    nearest(queue, sorted(known)),
                 )
 
     def close(self) -> None:

@@ -34,9 +34,9 @@ def settle(session: Session, job: Job, clock: Clock) -> None:
         if failed:
             job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
         elif pending:
-            others = f" and {len(pending) - 1} more" if len(pending) > 1 else ""
-            first = session.get_one(Job, pending[0])
-            job.move(Status.PENDING, f"waits for the success of job {named(first.name, first.id)}{others}")
+            jobs = (session.get_one(Job, each) for each in pending)
+            names = ", ".join(named(each.name, each.id) for each in jobs)
+            job.move(Status.PENDING, f"waits for the success of job{'s' if len(pending) > 1 else ''} {names}")
         else:
             job.move(Status.RUNNABLE, WAITING)
     elif job.status == Status.RUNNABLE:

@@ -316,7 +316,8 @@ def _close(state: AttemptState, verdict: Verdict, gone: Gone) -> do.Close:
                 return to(Status.FAILED, excerpt(verdict.reason, LONGEST_REASON - len(words)) + words)
             return to(Status.RUNNABLE, f"attempt {number} failed ({verdict.reason}){progress}; trying again")
         case Ending.FAILED | Ending.LOST if native:
-            return to(Status.FAILED, f"{verdict.reason} (attempt {spent} of {terms.allowed})")
+            times = "not tried again" if is_left else f"attempt {spent} of {terms.allowed}"
+            return to(Status.FAILED, f"{verdict.reason} ({times})")
     return to(Status.FAILED, verdict.reason)
 
 

@@ -193,9 +193,9 @@ class KeyStore:
         """Delete a key: this process refuses it from its next request on, others within a second. Raises KeyUsageError, DatabaseError."""
         with self._database.session() as session:
             deleted = session.execute(delete(AccessKey).where(AccessKey.name == name).returning(AccessKey.name)).all()
-        present = ", ".join(each.name for each in self.load().values()) or "no key"
+        present = ", ".join(each.name for each in self.load().values()) or "none"
         if not deleted:
-            raise KeyUsageError(f"there is no key {name!r}; there is {present}")
+            raise KeyUsageError(f"key {name!r} does not exist; available: {present}")
 
     def _loop(self) -> None:
         while not self._ending.wait(INTERVAL):

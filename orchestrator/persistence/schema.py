@@ -12,6 +12,8 @@ from orchestrator.persistence.own_models import KnownAccount  # noqa: F401 (its 
 MIGRATIONS = Path(__file__).parent / "migrations"
 NEWEST = max(path.name for path in (MIGRATIONS / "versions").glob("[0-9]*.py")).partition("_")[0]
 """Revision of the tables of :mod:`orchestrator.persistence.batch_models`."""
+BASE = "0021"
+"""Oldest revision that can be migrated."""
 _VERSION = Table("alembic_version", MetaData(), Column("version_num", String(32), primary_key=True))
 
 
@@ -26,7 +28,7 @@ class UnknownSchema(Exception):
     def __init__(self, revision: str | None) -> None:
         super().__init__(revision)
         self.revision = revision
-        self.is_older = revision is None or revision < NEWEST
+        self.is_older = revision is None or revision < BASE
 
 
 def schema_of(connection: Connection) -> str | None:

@@ -30,7 +30,7 @@ from sqlalchemy.orm import ORMExecuteState, Session
 from orchestrator.domain.errors import Unavailable
 from orchestrator.persistence.batch_models import Attempt, Job, Node
 from orchestrator.persistence.job_counts import JobCounts, note_counts
-from orchestrator.persistence.schema import NEWEST, UnknownSchema, bring_up_to_date, schema_of
+from orchestrator.persistence.schema import BASE, NEWEST, UnknownSchema, bring_up_to_date, schema_of
 from orchestrator.persistence.updates import write_changes
 from orchestrator.persistence.urls import connect_args, database_url, is_in_memory, shown
 
@@ -297,11 +297,11 @@ class Database:
             try:
                 bring_up_to_date(connection)
             except UnknownSchema as error:
-                where = f"database {shown(str(self.engine.url))}"
+                where = f"database {self.shown}"
                 if error.is_older:
                     raise DatabaseError(
-                        f"{where} has schema {error.revision or 'without a revision'}, and this Muster reads {NEWEST} or newer; lift it, "
-                        "in a clone of Muster, with: python -m docs.tools.lift_database URL-OR-FILE"
+                        f"{where} is from before schema {BASE}; lift it, in a clone of Muster, with: "
+                        f"python -m docs.tools.lift_database {self._file or self.shown}"
                     ) from None
                 raise DatabaseError(
                     f"{where} was written by a newer Muster (schema {error.revision}); install that version, or use another database"

@@ -11,6 +11,7 @@ from orchestrator.domain.errors import ClientError
 from orchestrator.spec.settings import task_config
 from orchestrator.spec.values import task_name
 from shared_store.contract import plugins
+from shared_store.contract.error_text import unknown_iteration
 from shared_store.volume.checkpoints import (
     Checkpoint,
     DamagedCheckpoint,
@@ -28,20 +29,20 @@ CONFLICT = 409
 def choose(run: Run, requested: int | Literal["best", "latest"] | None) -> Checkpoint | None:
     """The requested checkpoint; None for the newest one of a run that has none. Raises ClientError where it does not exist."""
     checkpoints = list_checkpoints(run)
-    available = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints) or "none yet"
+    known = [checkpoint.iteration for checkpoint in checkpoints]
     if requested in (None, "latest"):
         return checkpoints[-1] if checkpoints else None
     if requested == "best":
         chosen = best_checkpoint(run)
         problem = (
-            ": no checkpoint has a score yet, which is a mean over at least 100 episodes, and no two are evaluated; "
-            "name an iteration"
+            f"run {run.name}: no checkpoint has a score yet, which is a mean over at least 100 episodes, and no two are evaluated; "
+            f"name an iteration: {', '.join(map(str, known)) or 'none yet'}"
         )
     else:
         chosen = next((each for each in reversed(checkpoints) if each.iteration == requested), None)
-        problem = f" has no checkpoint of iteration {requested}; it has"
+        problem = unknown_iteration(run.name, requested, known)
     if chosen is None:
-        raise ClientError(f"run {run.name}{problem}: {available}", 404)
+        raise ClientError(problem, 404)
     return chosen
 
 

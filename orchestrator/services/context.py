@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -129,8 +129,7 @@ class Context:
         """The queue of this name or ARN; one that is being deleted only where ``deleting``. Raises ClientError."""
         queue = self.session.get(JobQueue, plain_name(reference, "job-queue"))
         if queue is None or (queue.deleting and not deleting):
-            available = ", ".join(queue_names(self.session, self.actor)[:5]) or "none yet"
-            raise ClientError(f"Job queue {reference[:300]} does not exist; there is {available}")
+            raise UnknownQueue(reference, queue_names(self.session, self.actor))
         return queue
 
     def definition(self, reference: str) -> JobDefinition:
@@ -172,6 +171,14 @@ class Context:
     def reason(self, job: Job) -> str | None:
         """The job's ``statusReason`` in the AWS Batch API; None before it has one."""
         return self.controller.admission.reason(job).aws or None
+
+
+class UnknownQueue(ClientError):
+    """A request names a queue that does not exist; ``known``: those that the caller may see."""
+
+    def __init__(self, name: str, known: Sequence[str], status: int = 400) -> None:
+        available = ", ".join(known[:10]) or "none"
+        super().__init__(f"Job queue {name[:300]} does not exist; available: {available}", status)
 
 
 def named_definition(session: Session, arn: str) -> JobDefinition | None:
@@ -237,7 +244,7 @@ def _absent(controller: Controller, actor: Actor, name: str) -> ClientError:
         if named is not None:
             return ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
     runs = [each.name for each in visible_runs(controller, actor, most=_COMPARED)]
-    others = "`muster show JOB` names a job's run" if runs else "no run exists yet"
+    others = "`muster runs` lists the runs" if runs else "no run exists yet"
     hint = nearest(name, runs, others, cutoff=0.3)
     return ClientError(f"run {name} does not exist in {controller.access.store.path}; {hint}", 404)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from sqlalchemy.orm import Session
 
 from orchestrator.control.controller import Controller
@@ -12,7 +10,7 @@ from orchestrator.domain.errors import ClientError
 from orchestrator.domain.gang import GangSpec, gang_needs
 from orchestrator.persistence.batch_models import JobQueue
 from orchestrator.scheduling.fit import Fit
-from orchestrator.services.context import queue_names
+from orchestrator.services.context import UnknownQueue, queue_names
 from orchestrator.services.permissions import Actor
 from orchestrator.spec.compile import compile_definition
 from orchestrator.spec.evaluations import automatic_evaluation, evaluation_settings, place_of
@@ -24,14 +22,6 @@ def fit_of(session: Session, actor: Actor, controller: Controller, queue: JobQue
     if found.problem or not (problem := _problem_of_evaluations(session, actor, controller, queue, gang)):
         return found
     return Fit(None, f"evaluation: {problem}")
-
-
-class UnknownQueue(ClientError):
-    """A request names a queue that does not exist; ``known``: those that the caller may see."""
-
-    def __init__(self, name: str, known: Sequence[str], status: int = 400) -> None:
-        available = ", ".join(known[:10]) or "none"
-        super().__init__(f"there is no queue {name[:100]!r}; there is {available}", status)
 
 
 def named_queue(session: Session, actor: Actor, name: str) -> JobQueue:

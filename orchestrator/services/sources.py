@@ -19,7 +19,7 @@ from orchestrator.services.chosen_checkpoints import check_evaluation, check_tas
 from orchestrator.services.context import Context, archived, permitted_run, release
 from orchestrator.services.permissions import Operation
 from shared_store.contract import plugins
-from shared_store.contract.error_text import shown
+from shared_store.contract.error_text import shown, unknown_iteration
 from shared_store.volume.checkpoints import Checkpoint, DamagedCheckpoint, list_checkpoints
 from shared_store.volume.contents import is_archived
 from shared_store.volume.initial_weights import TeacherCopy, named_parent
@@ -191,10 +191,8 @@ def _checkpoint(run: Run, source: SourceRun) -> Checkpoint:
         raise ClientError(f"{source.key}: run {source.run} has no checkpoint yet; train it first")
     meant = [checkpoint for checkpoint in checkpoints if _is_meant(checkpoint, source)]
     if not meant:
-        available = ", ".join(str(checkpoint.iteration) for checkpoint in checkpoints)
-        raise ClientError(
-            f"{source.key}: run {source.run} has no checkpoint of iteration {source.checkpoint}; it has: {available}"
-        )
+        known = (checkpoint.iteration for checkpoint in checkpoints)
+        raise ClientError(f"{source.key}: {unknown_iteration(source.run, source.checkpoint, known)}")
     return meant[-1]
 
 

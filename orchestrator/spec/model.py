@@ -51,7 +51,7 @@ from orchestrator.spec.values import (
 )
 from shared_store.contract import plugins
 from shared_store.contract.entry_points import clash
-from shared_store.contract.error_text import OF_PLUGIN, Refused, explain, kind_of, nearest, path_of, shown
+from shared_store.contract.error_text import OF_PLUGIN, Refused, explain, kind_of, nearest, other_places, path_of, shown
 from shared_store.volume.texts import beside
 
 KINDS = ("train", *plugins.evaluating(), "export", "record", "render", "command")
@@ -68,7 +68,7 @@ def _algorithm_name(value: str) -> str:
     known = list(ALGORITHMS)
     if value in known or re.fullmatch(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", value):
         return value
-    hint = nearest(value, known, f"there are {', '.join(known)}, and module:Class of your own")
+    hint = nearest(value, known, f"available: {', '.join(known)}, or your own as module:Class")
     raise ValueError(f"no algorithm is called {shown(value)}; {hint}")
 
 
@@ -316,10 +316,10 @@ def validate(
         spec = Spec.model_validate(value)
     except ValidationError as error:
         problems = error.errors(include_url=False)
-        more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
         # a misspelt key comes before the one that is missing for it: it has a line, and a nearest name
         first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
-        path = tuple(part for part in path_of(first) if isinstance(part, str | int))
+        path = path_of(first)
+        more = other_places(map(path_of, problems), path)
         raise SpecError(f"{place_of(path, source, lines)}{_explain(first, path)}{more}") from None
     problem = not_finite(value)
     if not problem and spec.train:

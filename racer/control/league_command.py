@@ -22,7 +22,7 @@ from orchestrator.cli.controllers import controller, see_through
 from orchestrator.cli.listings import Resource, show_facts
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.outputs import check_output
-from orchestrator.cli.progress import await_end
+from orchestrator.cli.progress import await_end, follow_main
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, NotServing, UsageError
@@ -264,7 +264,7 @@ def submit(
         client = connect()
         if evaluation is None:
             started = client.post(f"{path}/races", body, seconds=300, once=True)
-            code = see_through(client, started["jobId"], *([await_end] if as_json else []))
+            code = see_through(client, started["jobId"], await_end if as_json else follow_main)
             if code:
                 raise typer.Exit(code)
             body["version"], evaluation = (

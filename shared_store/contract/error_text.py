@@ -83,7 +83,18 @@ def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: flo
     """A hint about a name that is not in ``known``: the nearest of these, else ``otherwise``, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=cutoff)
-    return f"did you mean {near[0]}?" if near else otherwise or f"there are {', '.join(names) or 'none'}"
+    return f"did you mean {near[0]}?" if near else otherwise or f"available: {', '.join(names) or 'none'}"
+
+
+def other_places(places: Iterable[Path], named: Path) -> str:
+    """The further places that are wrong, as the end of a sentence about the ``named`` one; empty where there are none."""
+    others = dict.fromkeys(".".join(map(str, place)) for place in places if place != named)
+    return f" (also wrong or missing: {', '.join(others)})" if others else ""
+
+
+def unknown_iteration(run: str, iteration: object, known: Iterable[object]) -> str:
+    """That a run has no checkpoint of this iteration, with those that it has."""
+    return f"run {run} has no checkpoint of iteration {iteration}; available: {', '.join(map(str, known)) or 'none'}"
 
 
 def unknown_task(name: str, known: Iterable[str]) -> str:

@@ -20,8 +20,13 @@ class Phase(StrEnum):
 
     @property
     def words(self) -> str:
-        """For people; the longest phase has its duration."""
-        return f"{self} (the first time takes minutes)" if self is Phase.COMPILING else str(self)
+        """For people; kernels may be in the cache already."""
+        return "loading kernels (compiling them the first time takes minutes)" if self is Phase.COMPILING else str(self)
+
+    @property
+    def is_before_training(self) -> bool:
+        """Whether no iteration has begun."""
+        return self in (Phase.COMPILING, Phase.BUILDING)
 
 
 def phase_in(progress: Mapping[str, Any] | None) -> Phase | None:

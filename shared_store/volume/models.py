@@ -104,7 +104,7 @@ def find(
     if model := next((model for model in found if model.version == version), None):
         return model
     existing = ", ".join(str(model.version) for model in found)
-    raise UnknownModel(f"model {name} has no version {version}; there are: {existing}")
+    raise UnknownModel(f"model {name} has no version {version}; available: {existing}")
 
 
 def register(

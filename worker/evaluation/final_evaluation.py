@@ -48,9 +48,9 @@ class FinalEvaluation(Hook):
     def trained(self, loop: Loop, checkpoint: str) -> None:
         """Evaluate the policy, plot the curve, print the paths."""
         loop.say(f"evaluating checkpoint {checkpoint}")
+        loop.beacon.send(phase=Phase.EVALUATING)
         worlds = held_out_worlds(loop)
         drawing = self._draw(worlds) if self._draw and loop.gang.is_main else None
-        loop.beacon.send(phase=Phase.EVALUATING)
         result = evaluate(worlds, loop.algorithm.policy(), loop.gang, checkpoint=checkpoint)
         loop.say(str(result))
         if not loop.gang.is_main:
@@ -84,7 +84,7 @@ def held_out_worlds(loop: Loop) -> Task:
         total = min(loop.share.total, EVALUATED * loop.gang.size)
         share = WorldShare.of(loop.gang.rank, loop.gang.size, total)
         seed = held_out_seed(loop.training.seed)
-        worlds = build_task(type(loop.task), loop.config, share, loop.gang, seed, loop.beacon)
+        worlds = build_task(type(loop.task), loop.config, share, loop.gang, seed)
     last = max(0, progress.iteration - 1)
     begin_evaluation(worlds, last, progress.reward, progress.episode_length, adaptive_steps(loop.task))
     return worlds

@@ -47,7 +47,7 @@ def build_task(
     if beacon is not None:
         beacon.send(phase=Phase.COMPILING if is_cold else Phase.BUILDING)
     if gang.is_main and is_cold:
-        print("compiling kernels: this takes a minute or two, the first time", flush=True)
+        print("loading kernels: compiling them takes a minute or two, the first time", flush=True)
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
     name = f"{task_type.__module__}:{task_type.__qualname__}"
     with user_errors(), task_mistakes(name), gang.build_in_turn(marker):
@@ -217,10 +217,10 @@ def check_robots(then: Contract | None, task: Task, of: str, *, accept: bool) ->
     else:
         lines = []
         for name, reading in task.readings.items():
-            if found := [each for each in reading.corrected if not each.is_rounding]:
-                first, more = found[0], f" ({len(found) - 1} more)" if len(found) > 1 else ""
-                was, is_now = shown_value(first.built), shown_value(first.file)
-                lines.append(f"{name}: {first.element}: {first.field} was {was}, is {is_now}{more}")
+            for each in reading.corrected:
+                if not each.is_rounding:
+                    was, is_now = shown_value(each.built), shown_value(each.file)
+                    lines.append(f"{name}: {each.element}: {each.field} was {was}, is {is_now}")
     if not lines:
         return ""
     what = f"{of} was trained on another robot than the file gives now: {brief(lines)}"

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from shared_store.contract.error_text import unknown_iteration
 from shared_store.volume.checkpoints import (
     Checkpoint,
     DamagedCheckpoint,
@@ -68,8 +69,7 @@ def find_checkpoint(run: Run, choice: int | str | None) -> Checkpoint:
         return newest
     found = [c for c in checkpoints if choice == c.name or (str(choice).isdecimal() and int(choice) == c.iteration)]
     if not found:
-        iterations = ", ".join(str(c.iteration) for c in checkpoints) or "none"
-        raise UserError(f"run {run.name} has no checkpoint {choice}; there are: {iterations}")
+        raise UserError(unknown_iteration(run.name, choice, (each.iteration for each in checkpoints)))
     found[-1].verify()
     return found[-1]
 

@@ -6,6 +6,7 @@ import contextlib
 import ctypes
 import errno
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -35,6 +36,8 @@ _MOST_VALUES = 100
 """Names that a rank may report in all; further ones are dropped."""
 _LARGEST_NUMBER = 2**63
 _LARGEST_ERROR_FILE = 2**20
+_PLACE_IN_CPP = re.compile(r"\[(?:enforce fail at )?[^\]\s]*\.(?:cc|cpp|cu|h):\d+\] ?")
+_STACK_IN_CPP = re.compile(r"\n(?:Exception raised from |frame #\d+: |C\+\+ CapturedTraceback)")
 """Bytes; of a larger error file nothing is read."""
 
 
@@ -237,7 +240,7 @@ class Rank:
             message = (read_json(self.error_file, _LARGEST_ERROR_FILE) or {})["message"]
             if isinstance(message, str):
                 return FirstError(self.number, message, "", self.ended)
-            extra, text = message["extraInfo"], str(message["message"])
+            extra, text = message["extraInfo"], _in_one_line(str(message["message"]))
             when = float(extra.get("time") or extra.get("timestamp", self.ended))
             when = when if 0 <= when <= self.ended else self.ended
             trace = str(extra.get("py_callstack", ""))
@@ -264,6 +267,11 @@ class Rank:
             return FirstError(self.number, block[end], "\n".join(block[: end + 1]), self.ended, fault)
         last = next((line for line in reversed(lines) if line.strip()), None)
         return FirstError(self.number, last, "", self.ended) if last and self.exit_code else None
+
+
+def _in_one_line(message: str) -> str:
+    """The message of an error in one line, without the C++ files and stacks of Gloo and NCCL, which the log has."""
+    return " ".join(_PLACE_IN_CPP.sub("", _STACK_IN_CPP.split(message)[0]).split())
 
 
 def adopt_orphans() -> None:

@@ -12,7 +12,7 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError, WrapValidato
 from pydantic.errors import PydanticUserError
 from pydantic_core import ArgsKwargs
 
-from shared_store.contract.error_text import Path, explain, nearest
+from shared_store.contract.error_text import Path, explain, nearest, other_places
 from shared_store.contract.error_text import Refused as Refused
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def refused(error: ValidationError, where: Path, overrides: Mapping[str, Any]) -
     path = _keys(first["loc"], overrides)
     cause = first.get("ctx", {}).get("error")
     path, words = ((*path, *cause.path), cause.words) if isinstance(cause, Refused) else (path, explain(first))
-    more = f" (and {len(problems) - 1} more)" if len(problems) > 1 else ""
+    more = other_places((_keys(each["loc"], overrides) for each in problems), _keys(first["loc"], overrides))
     return Refused((*where, *path), f"{words}{more}")
 
 

@@ -131,7 +131,7 @@ class RslRlConfig:
             for group in requested:
                 if group not in groups:
                     known = ", ".join(groups)
-                    raise ValueError(f"obs_groups: {name}: there is no observation group {group!r}; there are {known}")
+                    raise ValueError(f"obs_groups: {name}: there is no observation group {group!r}; available: {known}")
 
     def check_actions(self, chooses: bool) -> None:
         """Raises ValueError for a task whose policy chooses one of several actions."""

@@ -120,7 +120,7 @@ class SACConfig:
         """
         if self.critic_group not in groups:
             known = ", ".join(groups)
-            raise ValueError(f"critic_group: there is no observation group {self.critic_group!r}; there are {known}")
+            raise ValueError(f"critic_group: there is no observation group {self.critic_group!r}; available: {known}")
         if images := [group for group in ("policy", self.critic_group) if groups[group]]:
             raise ValueError(f"it can't learn from images, and observation group {images[0]!r} is one; use ppo")
 

@@ -157,7 +157,7 @@ class Randomize:
         if isinstance(self.range, Mapping) and self.axes and set(self.axes) != set(self.range):
             raise ValueError(f"{self._where}: the range names other axes than axes={self.axes}; leave axes out")
         if isinstance(self.range, Mapping) and not self.range:
-            raise ValueError(f"{self._where}: the range names no axis; there are {', '.join(self.quantity.axes)}")
+            raise ValueError(f"{self._where}: the range names no axis; available: {', '.join(self.quantity.axes)}")
         for ends in self.ends:
             self._check_range(ends)
         self._check_seconds()

@@ -29,7 +29,7 @@ def find(names: Sequence[str], patterns: str | Iterable[str], what: str) -> list
     """
     chosen = [patterns] if isinstance(patterns, str) else list(patterns)
     if not chosen:
-        raise ValueError(f"no pattern for a {what} was given; there are {', '.join(names) or 'none'}")
+        raise ValueError(f"no pattern for a {what} was given; available: {', '.join(names) or 'none'}")
     found: set[int] = set()
     for pattern in chosen:
         matching = {index for index, name in enumerate(names) if name == pattern or fnmatchcase(name, pattern)}
@@ -73,7 +73,7 @@ def resolve(names: Sequence[str], values: Value | Mapping[str, Value], what: str
 
 
 def _existing_names(pattern: str, names: Sequence[str]) -> str:
-    everything = f"there are {', '.join(names) or 'none'}"
+    everything = f"available: {', '.join(names) or 'none'}"
     simple = pattern.strip("^$").replace(".*", "*")
     if simple != pattern and any(fnmatchcase(name, simple) for name in names):
         return f"patterns are like those of file names, not regular expressions: did you mean {simple!r}? {everything}"

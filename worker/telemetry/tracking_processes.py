@@ -46,7 +46,7 @@ class Tracking:
             if settings is None:
                 continue
             if name not in SERVICES:
-                raise UserError(f"track: no service is called {name}; there are: {', '.join(SERVICES)}")
+                raise UserError(f"track: no service is called {name}; available: {', '.join(SERVICES)}")
             facts = {"job": job.id, "attempt_ranks": int(os.environ.get("WORLD_SIZE") or 1)}
             order = {"run": str(job.run.path), "epoch": job.epoch, "train": job.section, "facts": facts}
             self._services.append(_Service(name, {**order, "service": name, "settings": settings}))

@@ -71,6 +71,12 @@ class Access:
         with_token = " or MUSTER_TOKEN" if self.token else ""
         return f"open to callers with a key{with_token}; `muster keys list` shows the keys"
 
+    def way_in(self) -> str:
+        """Where a refused caller gets a key."""
+        if self.token or self.known():
+            return "`muster keys list` shows the keys, `muster keys create NAME` creates one"
+        return "no key is left: on the controller's machine, `muster keys create NAME` creates one"
+
     def bearer(self, credential: str) -> Actor:
         """The owner of this token, or of ``ACCESS_KEY_ID:SECRET`` of a key. Raises Refusal."""
         if self.own_token and hmac.compare_digest(credential.encode(), self.own_token.encode()):
@@ -142,8 +148,7 @@ class Access:
             return access_key_id, actor_of_key(key)
         raise Refusal(
             "UnrecognizedClientException",
-            "this token is not known here: set MUSTER_TOKEN to the server's token, or to ACCESS_KEY_ID:SECRET of a key that "
-            "`muster keys list` shows",
+            f"this token is unknown: set MUSTER_TOKEN to the server's token, or to ACCESS_KEY_ID:SECRET of a key; {self.way_in()}",
         )
 
 

@@ -154,7 +154,7 @@ class Guard:
                 raise Refusal(
                     "UnrecognizedClientException",
                     f"The security token included in the request is invalid: there is no key {signed.access_key_id[:80]!r}; "
-                    "`muster keys list` shows the keys, `muster keys create NAME` creates one",
+                    f"{self.access.way_in()}",
                 )
             signed.check(head, datetime.now(UTC))
             signed.check_signature(head, await body.read(), key.secret)
@@ -162,7 +162,7 @@ class Guard:
         raise Refusal(
             "MissingAuthenticationToken",
             "a token is needed: set MUSTER_TOKEN (the server's token, or ACCESS_KEY_ID:SECRET of a key), send it as "
-            "'Authorization: Bearer …', or sign with AWS Signature Version 4; `muster keys create NAME` creates a key",
+            f"'Authorization: Bearer …', or sign with AWS Signature Version 4; {self.access.way_in()}",
         )
 
     async def _look_for(self, access_key_id: str, client: str) -> None:

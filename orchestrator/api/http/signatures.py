@@ -54,7 +54,12 @@ class Signed:
                 f"Credential {parts['Credential'][:160]!r}: expected KEY/DATE/REGION/SERVICE/aws4_request with service "
                 f"{' or '.join(OURS)}",
             )
-        signed = tuple(sorted(set(parts["SignedHeaders"].lower().split(";"))))
+        signed = tuple(parts["SignedHeaders"].split(";"))
+        if list(signed) != sorted({name.lower() for name in signed}):
+            raise Refusal(
+                "IncompleteSignature",
+                f"SignedHeaders {parts['SignedHeaders'][:160]!r}: expected lower-case names, sorted, each once",
+            )
         return cls(access_key_id, date, region, service, signed, parts["Signature"])
 
     def check(self, head: RequestHead, now: datetime) -> None:

@@ -25,9 +25,8 @@ from orchestrator.persistence.batch_models import Job, RunRecord
 from orchestrator.persistence.job_pages import contains, count, place_of, read_page
 from orchestrator.persistence.keyset import Cursor
 from orchestrator.persistence.ownership import owner_of
-from orchestrator.services.context import queue_names
+from orchestrator.services.context import UnknownQueue, queue_names
 from orchestrator.services.damaged_rows import DAMAGED, DamagedRow, reading
-from orchestrator.services.fit import UnknownQueue
 from orchestrator.services.permissions import Actor
 from orchestrator.spec.evaluations import AUTOMATIC_TAG
 from orchestrator.spec.model import KINDS

@@ -23,7 +23,7 @@ from orchestrator.persistence.batch_models import Attempt, ComputeEnvironment, J
 from orchestrator.persistence.job_counts import JobCounts
 from orchestrator.scheduling.order import score, weight
 from orchestrator.scheduling.snapshot import Queue
-from orchestrator.services.fit import UnknownQueue
+from orchestrator.services.context import UnknownQueue
 from orchestrator.services.permissions import Actor, JobsOf
 
 router = APIRouter()

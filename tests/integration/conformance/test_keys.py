@@ -87,6 +87,11 @@ def test_keys_come_and_go_without_a_restart_and_deleting_the_last_one_opens_noth
         wait_for(lambda: is_refused(server.url), what="the server's look at the keys")
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
         client(server.url, key.access_key_id, key.secret).list_jobs(jobQueue="default")
+        again = call_muster("list", home=tmp_path)
+        assert again.returncode == 1 and "`muster keys list` shows the keys" in again.stderr
+        assert call_muster("keys", "create", "c", home=tmp_path / "other").stdout.startswith(
+            "from now on everybody needs"
+        )
         made = call_muster("keys", "create", "b", "--queue", "robots", "--queue", "default", home=tmp_path)
         other = next(each for each in store.load().values() if each.name == "b")
         assert other.queues == ("robots", "default") and made.returncode == 0, made.stderr
@@ -97,6 +102,8 @@ def test_keys_come_and_go_without_a_restart_and_deleting_the_last_one_opens_noth
         assert "deleted key a\nthis was the last key" in done.stdout, done.stdout
         assert "its own user's requests on loopback" in done.stdout and "does not start without a key" in done.stdout
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
+        left = "no key is left: on the controller's machine"
+        wait_for(lambda: left in call_muster("list", home=tmp_path).stderr, what="the server's look at the keys")
         for each in (other, key):
             bearer = {"Authorization": f"Bearer {each.access_key_id}:{each.secret}"}
             wait_for(lambda sent=bearer: httpx.get(f"{server.url}/api/runs", headers=sent).status_code == 403)

@@ -233,7 +233,7 @@ def test_a_key_is_deleted_once_the_person_has_confirmed(console: Console) -> Non
     stream.close()
     assert bob.http.get("/", follow_redirects=False).status_code == 303
     bob.close()
-    assert "there is no key 'bob'" in visitor.submit("/keys/delete", name="bob", confirmed="yes").json()["message"]
+    assert "key 'bob' does not exist" in visitor.submit("/keys/delete", name="bob", confirmed="yes").json()["message"]
     own = visitor.submit("/keys/delete", name="admin").json()["question"]["text"]
     assert "It is your own key: you will be logged out." in own and "last key" not in own
 

@@ -208,7 +208,7 @@ def test_a_checkpoint_is_evaluated_exported_and_recorded_by_jobs_of_their_own(co
     for kind in ("evaluate", "export", "record"):
         accepting = spec_of(console, visitor.submit(f"/jobs/{training}/{kind}", accept_changed_robot="yes"))
         assert accepting[kind]["accept_changed_robot"] is True
-    assert "it has: 3, 6, 9" in visitor.refusal(f"/jobs/{training}/evaluate", checkpoint="7", status=404)
+    assert "available: 3, 6, 9" in visitor.refusal(f"/jobs/{training}/evaluate", checkpoint="7", status=404)
     assert visitor.submit(f"/jobs/{training}/evaluate", checkpoint="x").status_code == 400
 
 

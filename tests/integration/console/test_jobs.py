@@ -41,6 +41,7 @@ def many(console: Console, definition: str) -> list[str]:
 
 
 def test_the_newest_jobs_come_first_a_page_at_a_time(visitor: Visitor, many: list[str]) -> None:
+    assert visitor.http.get("/jobs", follow_redirects=False).headers["location"] == "/"
     first = visitor.page("/")
     assert names(first) == [f"job-{i}" for i in range(119, 69, -1)]
     assert "50 of 120" in first.text and not first.all("a", rel="prev")
@@ -219,7 +220,7 @@ def test_a_key_sees_its_queues_alone(console: Console, waiting: dict[str, str]) 
     with Client(console.url, console.secrets["lab"]) as client:
         assert [each["name"] for each in client.get("/api/queues")["queues"]] == ["lab"]
     refused = console.visitor("lab").page("/queues?queue=shared", 404)
-    assert "there is no queue 'shared'; there is lab" in refused.text
+    assert "Job queue shared does not exist; available: lab" in refused.text
 
 
 def test_one_stream_renews_all_tables(console: Console, waiting: dict[str, str]) -> None:

@@ -121,6 +121,7 @@ def test_the_comparison_is_that_of_the_command(console: Console, store: Store, m
     assert line in page.text
     for row in (fast, sure):
         assert " ".join(row.split()) in page.text
+    assert page.all("optgroup", label="other")
     grouped = console.visitor().page("/compare?run=fast*+sure").text
     assert "fast* (2)" in grouped and "1, 2" in grouped
 

@@ -260,7 +260,7 @@ def test_evaluations_that_never_start_are_refused(controller: Controller) -> Non
     for line in (submit, f"{submit} --dry-run", "resume taught", "clone taught --name twin"):
         for section, output in (
             ("resources: {gpus: 1}", "evaluation: each node needs 1 CPU, 1 GPU"),
-            ("queue: nowhere", "evaluation: there is no queue 'nowhere'; there is default"),
+            ("queue: nowhere", "evaluation: Job queue nowhere does not exist; available: default"),
         ):
             done = controller.muster(*line.split(), "--set", f"evaluation={{every: 2, {section}}}")
             assert (done.returncode, done.stderr.count("\n")) == (2, 1) and output in done.stderr, done.stderr

@@ -79,7 +79,7 @@ def test_a_waiting_clone_does_not_need_its_source_and_may_be_resumed(full: Servi
 
 REFUSED = {
     "nobody": "run nobody does not exist",
-    "taught@4": "run taught has no checkpoint of iteration 4; it has: 3, 6, 9",
+    "taught@4": "run taught has no checkpoint of iteration 4; available: 3, 6, 9",
     "taught --name taught": "run taught exists already: give the clone another --name",
     "taught --name 'a b'": "clone of run taught: name: expected letters",
     "empty": "run empty has no checkpoint yet, so there are no weights to begin with",
@@ -98,9 +98,9 @@ REFUSED = {
     "taught --set train.ppo.lr=1": r"clone of run taught: train\.ppo\.lr: unknown key",
     "taught --set name=y": "--set name=y: a clone has the name that --name gives it",
     "taught --nodes 9": "clone x: ",
-    "taught --queue nowhere": "there is no queue 'nowhere'; there is default",
+    "taught --queue nowhere": "Job queue nowhere does not exist; available: default",
     # before the weights are read: those of iteration 4 are damaged
-    "altered --queue nowhere": "there is no queue 'nowhere'; there is default",
+    "altered --queue nowhere": "Job queue nowhere does not exist; available: default",
 }
 """What is refused of a clone ``x``, and how."""
 CONFLICTS = ("taught --name taught", "old", "altered", "missing", "newer")
@@ -171,7 +171,7 @@ def student(tmp_path: Path, teacher: str) -> str:
     ("teacher", "output"),
     [
         ("nobody@3", "run nobody does not exist"),
-        ("taught@4", "run taught has no checkpoint of iteration 4; it has: 3, 6, 9"),
+        ("taught@4", "run taught has no checkpoint of iteration 4; available: 3, 6, 9"),
         ("idle", "run idle has no checkpoint yet; train it first"),
         ("taught@best", "expected RUN or RUN@ITERATION, found 'taught@best'"),
         ("../taught", "expected RUN or RUN@ITERATION"),

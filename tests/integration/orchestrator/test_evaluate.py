@@ -54,7 +54,7 @@ def evaluated(store: Store, run: str, name: str, mean: float, **facts: Any) -> N
 REFUSED = {
     "nosuch": "run nosuch does not exist",
     "taugt": "did you mean taught",
-    "taught@4": "run taught has no checkpoint of iteration 4; it has: 3, 6, 9",
+    "taught@4": "run taught has no checkpoint of iteration 4; available: 3, 6, 9",
     "taught@last": "expected an iteration, best or latest after @",
     "empty": "run empty has no checkpoint yet; train it first",
     "taught --episodes 0": "evaluate.episodes: expected a value greater than or equal to 1, found 0",

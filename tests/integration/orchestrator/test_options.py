@@ -57,6 +57,22 @@ def test_a_detached_run_needs_a_controller_and_an_engine_means_its_queue(lab: Se
     refused(["submit", spec, "--nodes", "2", "--set", "nodes=3"], lab.home, 2, "--set nodes=3: --nodes sets nodes")
 
 
+def test_what_does_not_exist_is_refused_with_what_does_and_in_words_of_the_options(lab: Serving) -> None:
+    for arguments, words in (
+        (("runs", "delete", "nope"), "run nope does not exist"),
+        (("list", "--run", "nope"), "run nope does not exist"),
+        (("queues", "create", "fine", "--like", "nope"), "Job queue nope does not exist; available: default"),
+        (("queues", "create", "a b"), "NAME 'a b': up to 128 letters"),
+        (("queues", "create", "default"), "Job queue default exists already; change it with update-job-queue"),
+        (("queues", "create", "fine", "--priority", "-1"), "--priority: "),
+        (
+            ("list", "--server", "127.0.0.1:8080"),
+            "--server 127.0.0.1:8080: expected the URL of a controller, such as http://127",
+        ),
+    ):
+        refused(arguments, lab.home, 2, words)
+
+
 def test_jobs_are_listed_by_state_name_run_age_and_owner_and_stopped_together(lab: Serving) -> None:
     jobs = [lab.gang(FOREVER, name=name) for name in ("wolf-1", "wolf-2", "sheep")]
     for job in jobs:
@@ -69,7 +85,7 @@ def test_jobs_are_listed_by_state_name_run_age_and_owner_and_stopped_together(la
     assert (
         names("--run", lab.detail(jobs[2])["run"]) == {"sheep"} == names("--name", "sheep", "--mine", "--since", "1h")
     )
-    assert names("--since", "0s") == set() and "no job fits" in lab.muster("list", "--run", "nowhere").stdout
+    assert names("--since", "0s") == set() and "no job fits" in lab.muster("list", "--name", "nowhere").stdout
     header, row = lab.muster("list", "--name", "sheep").stdout.splitlines()
     assert row[header.index("RUN ") :].split()[0] == lab.detail(jobs[2])["run"]
     stopped = printed(lab, "stop", "wolf-1", "wolf-2", "--reason", "enough")

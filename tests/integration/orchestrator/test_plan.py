@@ -109,7 +109,7 @@ def test_a_plan_a_submission_and_a_resume_place_a_job_as_its_compute_environment
     refusals = {
         "small": "compute environment small has at most 1 CPU; needs 3 nodes with 1.2 CPUs, 0 GPUs, 48 MiB in all",
         "elsewhere": "the largest host has nothing: there is no host",
-        "nowhere": "there is no queue 'nowhere'; there is default, elsewhere",
+        "nowhere": "Job queue nowhere does not exist; available: default, elsewhere",
     }
     with Client(inside.url) as client:
         for name, facts in environments.items():

@@ -99,7 +99,7 @@ def test_a_route_that_no_permission_could_guard_is_refused(server: Server, folde
         ("", "router.get('/{area}/{name}')(answer)", "its route GET /api/{area}/{name} is also that of the controller"),
         ("", "pages.get('/queues')(answer)", "its route GET /queues is also that of the controller (GET /queues)"),
         ("", "pages.get('/static/{name:path}')(answer)", "its route GET /static/{name:path} is also that of the controller"),
-        ("operations=('GET /api/tally',)", "router.get('/tallies')(answer)", "operations: no route of it serves GET /api/tally; there are GET /api/tallies"),
+        ("operations=('GET /api/tally',)", "router.get('/tallies')(answer)", "operations: no route of it serves GET /api/tally; available: GET /api/tallies"),
         ("operations=('POST /api/tally',)", "router.get('/tally')(answer)", "operations: no route of it serves POST /api/tally"),
         ("navigation=(('Tally', '/tally'),)", "router.get('/tally')(answer)", "navigation: no page of it serves /tally, to which Tally leads"),
         ("", "router = 3", "routers: tally_parts:router is int, and no APIRouter"),

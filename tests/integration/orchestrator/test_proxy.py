@@ -108,3 +108,9 @@ def test_there_is_no_socket_where_another_user_could_replace_it_or_its_path_is_t
         (tmp_path / name).mkdir()
         (tmp_path / name).chmod(mode)
         assert home.open_socket(tmp_path / name) is None and home.local_socket(tmp_path / name) is None
+    (tmp_path / "open").chmod(0o700)
+    listener = home.open_socket(tmp_path / "open")
+    assert listener is not None and home.local_socket(tmp_path / "open") is not None
+    (tmp_path / "open").chmod(0o777)
+    assert home.local_socket(tmp_path / "open") is None  # who waits in it now, is unknown
+    listener.close()

@@ -63,6 +63,7 @@ def test_what_jobs_of_the_batch_api_leave_goes_without_a_trace_but_what_they_mad
     assert len(runs_of(server)) == 5
     taken = json.loads(output(server, "gc", "--older-than", "0m", "--json"))
     assert sum(len(each["jobs"]) for each in taken["runs"]) == 6
+    assert taken["counts"]["jobs"] == 6 and taken["counts"]["runs"] == 4 and taken["counts"]["kept"] == 1
     assert runs_of(server) == [kept] and os.listdir(server.home / "store" / "trash") == []
     assert sorted(os.listdir(server.home / "store" / "runs" / kept / "logs")) == []
     for each in (gang, array, f"{array}:1", maker):

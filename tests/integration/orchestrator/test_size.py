@@ -146,4 +146,4 @@ def test_an_unknown_queue_is_refused_with_the_names_that_the_caller_may_see(insi
     actor = Actor("robots", frozenset({"robots"}))
     with inside.controller.database.session() as session, pytest.raises(ClientError) as refused:
         Context(session, inside.controller, actor).queue("nosuch")
-    assert str(refused.value) == "Job queue nosuch does not exist; there is none yet"
+    assert str(refused.value) == "Job queue nosuch does not exist; available: none"

@@ -177,7 +177,7 @@ def test_an_unknown_queue_is_named_with_the_nearest_one(tmp_path: Path, caplog: 
     server.start()
     server.close()
     reported = [each.getMessage() for each in caplog.records if each.name == "muster.webhooks"]
-    assert reported == ["webhook chat: there is no queue defualt now; did you mean default?"]
+    assert reported == ["webhook chat: Job queue defualt does not exist; did you mean default?"]
 
 
 def test_the_message_is_written_with_the_end_of_the_job_or_not_at_all(tmp_path: Path) -> None:

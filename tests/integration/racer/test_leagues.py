@@ -125,7 +125,7 @@ REFUSED = {
     "show cpu": "league cpu does not exist",
     "show cup 7": "league cup: entry 7 does not exist",
     "submit cup fats": "model fats does not exist; did you mean fast?",
-    "submit cup fast@9": "model fast has no version 9; there are: 1, 2, 3, 4",
+    "submit cup fast@9": "model fast has no version 9; available: 1, 2, 3, 4",
     "submit cup fast@x": "fast@x: expected a version after @, such as fast@1",
     "submit cup fast@3": "model fast@3 is of task Cartpole; a league takes models of the racer's installed tasks",
     "submit cup fast@4": "model fast@4 is of task my_tasks:Rocket; a league takes models of the racer's",

@@ -84,6 +84,12 @@ def test_a_traceback_is_the_fault_only_of_a_program_that_left_as_python_does_aft
 EXTRA = {"py_callstack": "Traceback …", "timestamp": "1234"}
 
 
+_OF_GLOO = (
+    "RuntimeError: [../third_party/gloo/gloo/transport/tcp/pair.cc:534] Connection closed by peer [10.0.0.2]:5\n"
+    "Exception raised from read at pair.cc:534 (most recent call first):\nframe #0: gloo::read()"
+)
+
+
 @pytest.mark.parametrize(
     ("content", "message", "traceback", "when"),
     [
@@ -95,6 +101,12 @@ EXTRA = {"py_callstack": "Traceback …", "timestamp": "1234"}
         ("", "on stderr", "", None),
         ({"message": {"message": "m", "extraInfo": [1]}}, "on stderr", "", None),
         ({"message": {"message": "m", "extraInfo": {"time": -1e300}}}, "m", "", None),
+        (
+            {"message": {"message": _OF_GLOO, "extraInfo": {}}},
+            "RuntimeError: Connection closed by peer [10.0.0.2]:5",
+            "",
+            None,
+        ),
         ({"message": "x" * 100_000}, "x" * (LONGEST_TEXT - 64) + " … (83680 characters left out)", "", None),
     ],
 )

@@ -101,7 +101,7 @@ def test_a_training_and_its_checkpoint_are_recorded_and_rendered(server: Serving
         ("render", run.name, "-o", str(picture)): f"-o {picture}: it exists; --overwrite replaces it",
         ("compare", run.name, "other", "-o", str(drawn)): f"-o {drawn}: it exists; --overwrite replaces it",
         ("record", "nothing", "-o", "x.mcap"): "run nothing does not exist",
-        ("record", f"{run.name}@7", "-o", "x.mcap"): f"no checkpoint of iteration 7; the nearest is {iterations[0]}",
+        ("record", f"{run.name}@7", "-o", "x.mcap"): f"no checkpoint of iteration 7; available: {iterations[0]}",
         ("record", run.name, "-o", str(tmp_path)): "it is a directory; name a file in it",
         ("record", run.name, "-o", str(tmp_path / "no" / "x.mcap")): f"{tmp_path / 'no'} is not a directory",
         ("record", run.name, "-o", "x.bag"): "unknown ending; use one of .mcap",

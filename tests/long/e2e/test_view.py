@@ -225,7 +225,7 @@ def test_what_can_t_be_viewed_is_refused_in_one_line(server: Serving, job: str, 
     refused = {
         ("view", "nothing"): "run nothing does not exist",
         ("view", "nothing.mcap"): "nothing.mcap: no such file",
-        ("view", f"{run.name}@7"): "no checkpoint of iteration 7; the nearest is",
+        ("view", f"{run.name}@7"): "no checkpoint of iteration 7; available: ",
         ("view", run.name, "--memory", "much"): "expected a number with MB or GB",
         ("view", str(tmp_path / "text.mcap")): "it does not begin as an MCAP file does",
         ("view", str(tmp_path / "text.rrd")): "it does not begin as an .rrd file does",

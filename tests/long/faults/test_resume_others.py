@@ -291,7 +291,7 @@ def test_a_pupil_begins_with_the_copy_of_its_teacher_that_its_run_holds(store: P
         started = runner(training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl=settings)).algorithm
         original = go_on(store, "pupil", PUPIL_RUN).algorithm.state_dict()["teacher_state_dict"]["mlp.0.weight"]
         assert torch.equal(started.state_dict()["teacher_state_dict"]["mlp.0.weight"], original)
-    with pytest.raises(UserError, match="run rsl has no checkpoint 2; there are: 1"):
+    with pytest.raises(UserError, match="run rsl has no checkpoint of iteration 2; available: 1"):
         runner(
             training(opened.path, run="waited", algorithm="rsl_rl", rsl_rl={**settings, "teacher_checkpoint": "rsl@2"})
         )

@@ -406,7 +406,7 @@ REFUSED: Mapping[str, tuple[DifferentialIK, dict[str, Any]]] = {
     "DifferentialIK.soft_factor is 1.5; use a number > 0, at most 1": (MOVED, {"soft_factor": 1.5}),
     "DifferentialIK.joints: grip does not move tip; those that do: shoulder, elbow": (MOVED, {"joints": "*"}),
     "DifferentialIK.axes: there is no axis 'qw'": (MOVED, {"axes": ("x", "qw")}),
-    "DifferentialIK.axes: there is no axis 'roll'; there are x, y, z, qx": (ABSOLUTE, {"axes": ("x", "roll")}),
+    "DifferentialIK.axes: there is no axis 'roll'; available: x, y, z, qx": (ABSOLUTE, {"axes": ("x", "roll")}),
     "DifferentialIK.axes has qx, qw; an orientation is qx, qy, qz, qw, in": (ABSOLUTE, {"axes": ("x", "qx", "qw")}),
     "DifferentialIK.frame is 'wrld'; did you mean world?": (ABSOLUTE, {"frame": "wrld"}),
     "DifferentialIK.from_targets adds up movements; leave it out where absolute=True": (

@@ -154,7 +154,7 @@ def test_a_job_with_images_and_numbers_is_accepted_and_its_groups_are_checked_at
     assert effective_problem(RslRlConfig, "rsl_rl", config, groups) is None
     wrong = effective_problem(RslRlConfig, "rsl_rl", config, {"obs_groups": {"actor": ["policy", "camrea"]}})
     assert wrong is not None
-    assert "there is no observation group 'camrea'; there are policy, critic, camera" in wrong[1]
+    assert "there is no observation group 'camrea'; available: policy, critic, camera" in wrong[1]
     wrong = effective_problem(SACConfig, "sac", config, {"critic_group": "camera"})
     assert wrong is not None and "it can't learn from images, and observation group 'camera' is one" in wrong[1]
 

@@ -167,7 +167,7 @@ def test_a_selection_of_missing_or_fixed_parts_is_refused_in_one_line() -> None:
             return replace(declared, sensors={**declared.sensors, "cubes": ObjectSelection(self.selected)})
 
     output = refusal(Wrong.sketch, LiftCubesConfig())
-    assert "sensors.cubes: no object matches 'cubs'; " in output and "there are robot, cube_0" in output
+    assert "sensors.cubes: no object matches 'cubs'; " in output and "available: robot, cube_0" in output
     Wrong.selected = "s*"
     fixed = "sensors.cubes: ObjectSelection: shelf is fixed to the world; leave it out"
     assert fixed in refusal(Wrong.sketch, LiftCubesConfig())

@@ -322,7 +322,7 @@ def test_inverse_weights_follow_the_masses_as_in_mujoco(kind: str) -> None:
         ("mass", {"bodies": "*", "range": (1.0,)}, "is not a pair; give two numbers, such as (0.8, 1.2)"),
         ("gravity", {"range": (0.0, 1.0), "distribution": "log_uniform"}, "has no logarithm"),
         ("gravity", {"range": (0.0, -1.0), "distribution": "normal"}, "a mean and a standard deviation"),
-        ("gravity", {"distribution": "gaussian"}, "can't be 'gaussian'; there are uniform, log_uniform, normal"),
+        ("gravity", {"distribution": "gaussian"}, "can't be 'gaussian'; available: uniform, log_uniform, normal"),
         ("gravity", {"when": "restart"}, "when can't be 'restart'"),
         ("payload", {"bodies": "*", "operation": "scale"}, "operation can't be 'scale'"),
         ("friction", {"geoms": "*", "axes": ("rolling",)}, "it has no axis 'rolling'; did you mean roll?"),

@@ -61,10 +61,10 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "output"),
     [
-        (("export", "RUN@7"), "run RUN has no checkpoint of iteration 7; the nearest is 2; it has: 1, 2"),
+        (("export", "RUN@7"), "run RUN has no checkpoint of iteration 7; available: 1, 2"),
         (("export", "RUNX"), "did you mean RUN?"),
         (("export", "RUN", "-o", "/"), "-o /: exists already; name a new directory"),
-        (("models", "register", "RUN@7", "--name", "x"), "run RUN has no checkpoint of iteration 7; it has: 1, 2"),
+        (("models", "register", "RUN@7", "--name", "x"), "run RUN has no checkpoint of iteration 7; available: 1, 2"),
         (("models", "register", "RUN", "--name", "../x"), "model name '../x': use letters, digits"),
         (("models", "show", "nothing"), "model nothing does not exist"),
         (("models", "verify", "cart@0"), "cart@0: expected a version after @, such as cart@1"),

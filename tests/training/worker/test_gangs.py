@@ -245,7 +245,7 @@ def a_teacher_that_is_missing_is_refused_by_all_ranks(gang: Gang, store: Path) -
 
 
 def test_a_teacher_that_is_missing_is_refused_by_all_ranks(reported: list[Any]) -> None:
-    assert reported == ["UserError: run taught has no checkpoint 1; there are: none"] * 2
+    assert reported == ["UserError: run taught has no checkpoint of iteration 1; available: none"] * 2
 
 
 @case

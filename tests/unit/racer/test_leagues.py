@@ -60,10 +60,10 @@ def test_an_unknown_league_or_entry_is_reported_with_the_existing_ones(store: St
     cup = leagues.create(store, league())
     with pytest.raises(UnknownLeague, match=r"^league cpu does not exist; did you mean cup\?$"):
         leagues.find(store, "cpu")
-    with pytest.raises(UnknownLeague, match=r"^league cup: entry 1 does not exist; there is none yet$"):
+    with pytest.raises(UnknownLeague, match=r"^league cup: entry 1 does not exist; available: none$"):
         cup.entry(1)
     cup.enter(entry())
-    with pytest.raises(UnknownLeague, match=r"^league cup: entry 2 does not exist; there are 1 to 1$"):
+    with pytest.raises(UnknownLeague, match=r"^league cup: entry 2 does not exist; available: 1$"):
         cup.disqualify(2, "x", "user ada")
 
 

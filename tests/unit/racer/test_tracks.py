@@ -216,7 +216,7 @@ def test_a_name_means_a_preset_a_seed_or_a_track_of_the_store(store: Store) -> N
         (f"random:{2**63}", "after random: stands an integer"),
         ("random:" + "9" * 9999, "after random: stands an integer"),
         ("../hills", "there is no such track"),
-        ("q\nq", "track 'q\\nq': there is no such track; there are oval, rounded-rectangle, chicane, hills, random:7"),
+        ("q\nq", "track 'q\\nq': there is no such track; available: oval, rounded-rectangle, chicane, hills, random:7"),
     ],
 )
 def test_a_name_that_means_nothing_is_refused_with_the_nearest_one(store: Store, name: str, words: str) -> None:

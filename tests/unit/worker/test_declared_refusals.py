@@ -99,10 +99,10 @@ MISFITS: dict[str, Any] = {
     "rewards.place: _untyped: its parameter joint has no type": Reward(_untyped),
     "rewards.place: 'nothing_alike' is not a function; a term is a": Reward("nothing_alike"),
     "rewards.place: 'joint_speeed' is not a function; did you mean terms.joint_speed?": Reward("joint_speeed"),
-    "rewards.place: no joint of robot matches 'third'; there are first, second": Reward(
+    "rewards.place: no joint of robot matches 'third'; available: first, second": Reward(
         terms.joint_position, joints="third"
     ),
-    "rewards.place: the task has no robot or object 'cube'; there are robot": Reward(
+    "rewards.place: the task has no robot or object 'cube'; available: robot": Reward(
         terms.joint_position, robot="cube"
     ),
     "rewards.place.limit: expected a number, found (1.0, 2.0)": Reward(terms.joint_velocity_excess, limit=(1.0, 2.0)),
@@ -192,6 +192,6 @@ def test_a_curriculum_is_checked_when_the_task_is_built() -> None:
         ("randomize.mass.range", ".randomize.mass.range: randomize mass"),
         ("events.kik.speed", ": the task has no number 'events.kik.speed'; did you mean events.kick.speed?"),
         ("sped", ": the task has no number 'sped'; did you mean events.kick.speed?"),
-        ("alive", ": the task has no number 'alive'; there are actions.force.clip, "),
+        ("alive", ": the task has no number 'alive'; available: actions.force.clip, "),
     ):
         assert refused(curricula={"heavy": Adaptive(place, 1.0, 0.0)}).startswith(f"curricula.heavy{output}")

@@ -61,7 +61,7 @@ ASSETS = "package:newton/examples"
 CASES: dict[str, Callable[[], Any]] = {
     "its XML has no actuators ... PositionActuator ... joints: left_hip, left_knee": robot(actuators=()),
     "PositionActuator('left_kne'): no joint of robot matches 'left_kne'; did you mean left_knee? "
-    "there are left_hip, left_knee": robot(MISTYPED),
+    "available: left_hip, left_knee": robot(MISTYPED),
     "not regular expressions ... did you mean '*_knee'?": robot(EXPRESSION),
     "no pattern for a joint of robot was given": robot(PositionActuator((), 1.0, 1.0)),
     "robot: two actuators drive the joint left_knee ... PositionActuator('*') ... ('*_knee')": robot(SERVO, KNEES),

@@ -84,7 +84,7 @@ def test_a_joint_that_mimics_a_fixed_one_does_not_follow_and_says_so() -> None:
         ),
         (urdf(link("a"), joint("i", "a", "a")), "links move each other in a circle, a below a (joint i)"),
         (urdf(link("a"), link("b"), joint("i", "q", "b")), "joint i: the parent 'q' is not a link of the file"),
-        (follower('<mimic joint="nope"/>'), "joint k mimics 'nope', which is not a joint of the file; there are i"),
+        (follower('<mimic joint="nope"/>'), "joint k mimics 'nope', which is not a joint of the file; available: i"),
         (follower('<mimic joint="k"/>'), "joint k mimics itself"),
         (
             urdf(link("a"), link("b"), link("c"), joint("i", "a", "b"), joint("f", "b", "c", kind="floating")),

@@ -62,7 +62,7 @@ SCHEDULE = r"algorithm\.rnd_cfg\.weight_schedule"
         (ppo(rnd_cfg=scheduled(mode="step", final_step=3)), rf"{SCHEDULE}\.final_value: is required$"),
         (ppo(num_minibatches=2), r"algorithm\.num_minibatches: there is no such key; did you mean num_mini_batches\?$"),
         (ppo(symmetry_cfg={"mirror": "a:b"}), r"algorithm\.symmetry_cfg\.data_augmentation_func: is required$"),
-        (ppo(rnd_cfg=scheduled(mode="constant", steps=3)), rf"{SCHEDULE}\.steps: there is no such key; there are"),
+        (ppo(rnd_cfg=scheduled(mode="constant", steps=3)), rf"{SCHEDULE}\.steps: there is no such key; available:"),
         ({"obs_groups": {"critc": ["policy"]}}, r"obs_groups\.critc: PPO has no such set; did you mean critic\?$"),
         (ppo(class_name="Distillation"), r"teacher_checkpoint: name the run that trained the teacher$"),
         ({"teacher_checkpoint": "taught"}, r"teacher_checkpoint: PPO has no teacher; leave it out$"),

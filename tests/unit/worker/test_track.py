@@ -203,7 +203,7 @@ def job(run: Run, **requested: Any) -> Job:
     ("arguments", "output"),
     [
         (["RUN"], "error: usage: python -m worker.track RUN_DIRECTORY wandb|mlflow"),
-        (["RUN", "neptune"], "error: no service is called neptune; there are: wandb, mlflow"),
+        (["RUN", "neptune"], "error: no service is called neptune; available: wandb, mlflow"),
         (["nowhere", "wandb"], "nowhere is not a run that a `train` job made; name a directory of runs/ in the store"),
     ],
 )

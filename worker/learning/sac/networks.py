@@ -25,7 +25,7 @@ def size_of(spaces: Spaces, group: str) -> int:
     """Length of one observation of a group. Raises ValueError for an unknown group or a group of images."""
     if group not in spaces.observations:
         known = ", ".join(spaces.observations)
-        raise ValueError(f"sac.critic_group: there is no observation group {group!r}; there are {known}")
+        raise ValueError(f"sac.critic_group: there is no observation group {group!r}; available: {known}")
     shape = spaces.observations[group]
     if len(shape) != 1:
         raise ValueError(f"sac: it can't learn from images, and observation group {group!r} is one; use ppo")

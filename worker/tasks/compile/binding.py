@@ -374,7 +374,7 @@ class Binder:
         if name is None and len(fitting) == 1:
             return fitting[0]
         if name not in self.sensors:
-            hint = f"there are {', '.join(fitting)}" if fitting else "the task declares none"
+            hint = f"available: {', '.join(fitting)}" if fitting else "the task declares none"
             raise ValueError(f"{place}: {parameter}= names a sensor that gives {shown_type(kind)}; {hint}")
         if name not in fitting:
             gives = shown_type(self.sensors[name].arrays_type)

@@ -167,5 +167,5 @@ def _by_joint(place: str, values: Mapping[str, float] | float, names: list[str])
         raise ValueError(f"{place}: {error}") from error
     result = {name: float(value) for name, value in zip(names, found, strict=True) if value is not None}
     if not result:
-        raise ValueError(f"{place}: name at least one joint; there are {', '.join(names) or 'none'}")
+        raise ValueError(f"{place}: name at least one joint; available: {', '.join(names) or 'none'}")
     return result

@@ -238,6 +238,14 @@ def test_a_signed_header_can_be_neither_left_out_nor_renamed(
     assert answer_to(replace(before, headers=headers), store) in REFUSALS
 
 
+@pytest.mark.parametrize("names", ["x-amz-date;host", "host;host;x-amz-date", "Host;x-amz-date", "host;;x-amz-date"])
+def test_the_signed_headers_are_sorted_lower_case_and_unique(store: KeyStore, key: Key, names: str) -> None:
+    before = signed(Sent("GET", "/", "", (), b""), signer_of(key, "batch", "us-east-1"))
+    changed = header(before, "authorization").replace("SignedHeaders=host;x-amz-date", f"SignedHeaders={names}")
+    others = tuple(each for each in before.headers if each[0] != "authorization")
+    assert answer_to(replace(before, headers=(*others, ("authorization", changed))), store) == "IncompleteSignature"
+
+
 @settings(max_examples=50)
 @given(requests(), places, st.text(LETTERS, max_size=5))
 def test_a_header_of_amazons_that_is_added_after_signing_is_refused(

@@ -40,7 +40,7 @@ MISUSE = {
     "resume ant@3 --checkpoint 4": "--checkpoint 4: ant@3 names a checkpoint, too; leave one of them out",
     "--server http://x keys list": "--server: muster keys works on this machine, without a controller; leave --server out",
     "runs --search ant list": "--search: an option of muster runs alone; leave list out",
-    "list --server=": "--server: give the URL of a controller, such as http://127.0.0.1:8080",
+    "list --server=": "--server: expected the URL of a controller, such as http://127.0.0.1:8080",
     "keys list --server http://x": "--server: unknown option; see: muster keys list --help",
 }
 

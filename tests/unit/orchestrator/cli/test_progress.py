@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from orchestrator.cli.progress import _Bar, _Lines
+from orchestrator.cli.progress import _Bar, _Lines, following
+from orchestrator.domain.errors import ApiError
 
 DETAIL: dict[str, Any] = {
     "spec": {"train": {"iterations": 9}},
@@ -36,7 +37,7 @@ def test_a_warning_names_the_run(capsys: pytest.CaptureFixture[str]) -> None:
 LAST = {**RECORD, "iteration": 9, "warnings": []}
 PHASES = {
     None: "loading libraries",
-    "compiling kernels": "compiling kernels (the first time takes minutes)",
+    "compiling kernels": "loading kernels (compiling them the first time takes minutes)",
     "building worlds": "building worlds",
     "training": "training",
 }
@@ -51,6 +52,7 @@ def test_plain_lines_have_each_phase_once_before_the_first_iteration_and_after_t
             lines.show(running(phase), None)
             lines.show(running(phase), None)
         lines.show(running("training"), RECORD)
+        lines.show(running("building worlds"), RECORD)  # what the node reported before its first iteration
         lines.show(running(AT_THE_END[0]), LAST)
         for phase in AT_THE_END:
             lines.show(running(phase), None)
@@ -68,9 +70,9 @@ def test_the_bar_shows_the_phase_and_for_how_long_unless_iterations_come(monkeyp
 
     assert text(running(None)) == "loading libraries (0 s)"
     now[0] = 70.0
-    assert text(running("compiling kernels")) == "compiling kernels (the first time takes minutes) (0 s)"
+    assert text(running("compiling kernels")) == f"{PHASES['compiling kernels']} (0 s)"
     now[0] = 95.0
-    assert text(running("compiling kernels")) == "compiling kernels (the first time takes minutes) (25 s)"
+    assert text(running("compiling kernels")) == f"{PHASES['compiling kernels']} (25 s)"
     assert text(running("training")) == "training (0 s)", "the first iteration"
     assert text(running("training"), RECORD).startswith("3/9  reward 1.00")
     assert text(running("training")).startswith("3/9  reward 1.00")
@@ -81,3 +83,13 @@ def test_the_bar_shows_the_phase_and_for_how_long_unless_iterations_come(monkeyp
     assert (
         text({**running(None), "status": "RUNNABLE", "statusReason": "waits for job a"}) == "RUNNABLE: waits for job a"
     )
+
+
+def test_a_follower_that_the_controller_refuses_from_now_on_learns_that_the_job_continues() -> None:
+    with (
+        pytest.raises(
+            ApiError, match=r"^job 00000000 continues, but .*: a token is needed; then: muster logs 00000000 -f$"
+        ),
+        following(DETAIL["id"]),
+    ):
+        raise ApiError("a token is needed", 403)

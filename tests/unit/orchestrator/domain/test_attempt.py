@@ -339,7 +339,7 @@ FAILED_LAST = with_terms(ending(Ending.FAILED), spent=2)
 """In the third of three attempts."""
 AT_ONCE = ran(ending(REQUEUE), LEFT - 1)
 S = Status
-DONE_SO, LAST_SO = "done before it was preempted", "why (attempt 2 of 3)"
+DONE_SO, LAST_SO = "done before it was preempted", "why (not tried again)"
 STOPPED_LATE = "done before it was stopped"
 
 FAULT, OTHER = "ValueError in reward.py, line 3", "ValueError in reward.py, line 4"

@@ -68,7 +68,7 @@ NO = "has no such option"
 WRONG_TAGS = {
     "muster:partiton|gpu|slurm": f": a compute environment of the slurm engine {NO}; did you mean partition?",
     "muster:job-que|night|aws-batch|queue": f": a queue of the aws-batch engine {NO}; did you mean job-queue?",
-    "muster:gpu|a100|local|queue": f": a queue of the local engine {NO}; there are images",
+    "muster:gpu|a100|local|queue": f": a queue of the local engine {NO}; available: images",
     "muster:nice|much|slurm|queue": " is 'much', not an integer; it is sbatch's --nice of a job without priority",
     "muster:account| |slurm|queue": " is empty; it is an account",
     "muster:images|refused|local": " is 'refused'; did you mean refuse?",

@@ -125,7 +125,7 @@ URI += "MLFLOW_TRACKING_PASSWORD as secrets"
 STORED = "the key would be stored in the run; remove it, and give it as a secret: secrets"
 WRONG_TRACKING = {
     "track: wandv": "track: no service is called 'wandv'; did you mean wandb?",
-    "track: [wandb, 3]": "track: no service is called '3'; there are wandb, mlflow",
+    "track: [wandb, 3]": "track: no service is called '3'; available: wandb, mlflow",
     "track: 3": "track: expected wandb, mlflow, a list of them, or each with its settings, found 3",
     "track: {wandb: {projct: x}}": "track.wandb.projct: unknown key; did you mean project?",
     "track: {wandb: {mode: 'off'}}": "track.wandb.mode: expected 'online' or 'offline', found 'off'",

@@ -32,9 +32,9 @@ WRONG = {
     "Cartpole sac policy_delay: 3": "updates: expected a multiple of policy_delay (3), got 8",
     "Cartpole sac v_min: 9.0": "v_min: expected less than v_max (5), got 9",
     "CartpolePixels sac updates: 8": "it can't learn from images, and observation group 'policy' is one; use ppo",
-    "Ant sac critic_group: critics": "critic_group: there is no observation group 'critics'; there are policy, critic",
+    "Ant sac critic_group: critics": "critic_group: there is no observation group 'critics'; available: policy, critic",
     "Ant rsl_rl obs_groups: {critic: [critics]}": (
-        "obs_groups: critic: there is no observation group 'critics'; there are policy, critic"
+        "obs_groups: critic: there is no observation group 'critics'; available: policy, critic"
     ),
     "Ant rsl_rl algorithm: {class_name: Distillation}": "teacher_checkpoint: name the run that trained the teacher",
     "Ant rsl_rl teacher_checkpoint: taught@3": "teacher_checkpoint: PPO has no teacher; leave it out",

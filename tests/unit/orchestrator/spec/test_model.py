@@ -55,13 +55,13 @@ LINES = {
     "checkpoint: {evry: 1}": "checkpoint.evry: unknown key; did you mean every?",
     "checkpoint: {whatever: 1}": "checkpoint.whatever: unknown key; did you mean every?",
     "retry: {zz: 1}": "retry.zz: unknown key; valid here: attempts",
-    "nodes: {min: 3, mx: 4}": "nodes.mx: unknown key; did you mean max? (and 1 more)",
+    "nodes: {min: 3, mx: 4}": "nodes.mx: unknown key; did you mean max? (also wrong or missing: nodes.max)",
     "nodes: {min: 3}": "nodes.max: is required",
     "nodes: three": f"nodes: {NODES}, found 'three'",
     "nodes: true": f"nodes: {NODES}, found True",
     "nodes: 1.5": f"nodes: {NODES}, found 1.5",
-    "nodes: 0": "nodes.min: expected a value greater than or equal to 1, found 0 (and 1 more)",
-    "nodes: 5001": "nodes.min: expected a value less than or equal to 5000, found 5001 (and 1 more)",
+    "nodes: 0": "nodes.min: expected a value greater than or equal to 1, found 0 (also wrong or missing: nodes.max)",
+    "nodes: 5001": "nodes.min: expected a value less than or equal to 5000, found 5001 (also wrong or missing: nodes.max)",
     "nodes: {min: 3, max: 2}": "nodes: min (3) is more than max (2)",
     "resources: 3": "resources: expected an object, found an integer (3)",
     "resources: {memory: 1MiB}": "resources.memory: expected a value greater than or equal to 4, found 1",
@@ -101,10 +101,10 @@ FILES: dict[str, str] = {
     f"name: a\n{TRAIN}\nxyzzyq: 2\n": f":3: xyzzyq: unknown key; valid here: {TOP}",
     f"name: a\n{TRAIN}\nrally: {{run: x}}\n": f":3: rally: unknown key; valid here: {TOP} ({OF_PLUGIN})",
     f"name: a\n{TRAIN}\nnodez: {{run: x}}\n": f":3: nodez: unknown key; did you mean nodes? ({OF_PLUGIN})",
-    "nme: a\ncommand: [x]\n": ":1: nme: unknown key; did you mean name? (and 1 more)",
-    f"name: a\n{TRAIN}\nnodez: 2\nretyr: 2\n": ":3: nodez: unknown key; did you mean nodes? (and 1 more)",
+    "nme: a\ncommand: [x]\n": ":1: nme: unknown key; did you mean name? (also wrong or missing: name)",
+    f"name: a\n{TRAIN}\nnodez: 2\nretyr: 2\n": ":3: nodez: unknown key; did you mean nodes? (also wrong or missing: retyr)",
     "name: a\ntrain:\n  task: Cartpole\n  worlds: 4\n  iteration: 2\n": (
-        ":5: train.iteration: unknown key; did you mean iterations? (and 1 more)"
+        ":5: train.iteration: unknown key; did you mean iterations? (also wrong or missing: train.iterations)"
     ),
     "name: a\ncommand: [x]\nresources:\n  gpu: 1\n": ":4: resources.gpu: unknown key; did you mean gpus?",
     "name: a\nevaluate: {run: x, checkpont: 3}\n": ":2: evaluate.checkpont: unknown key; did you mean checkpoint?",
@@ -133,7 +133,7 @@ FILES: dict[str, str] = {
         f":2: train.task: no task is called 'Cartpoel'; did you mean Cartpole? (your own: module:Class; {OF_PLUGIN})"
     ),
     "name: a\ntrain: {task: zzz, worlds: 4, iterations: 2}\n": (
-        f":2: train.task: no task is called 'zzz'; there are {TASKS} (your own: module:Class; {OF_PLUGIN})"
+        f":2: train.task: no task is called 'zzz'; available: {TASKS} (your own: module:Class; {OF_PLUGIN})"
     ),
     "name: a\nevaluate: {run: ../x}\n": f":2: evaluate.run: {RUN_LETTERS}, found '../x'",
     "name: a\nexport: {run: x, checkpoint: new}\n": (

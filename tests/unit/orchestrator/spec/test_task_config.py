@@ -31,7 +31,7 @@ WRONG = {
     "Ant fall_hight: 0.3": "fall_hight: AntConfig has no such key; did you mean fall_height?",
     "Ant randomize: {mas: [1, 2]}": "randomize.mas: Randomization has no such key; did you mean mass?",
     "Ant rewards: {foward: 1.0}": "rewards.foward: the task has no term 'foward'; did you mean forward?",
-    "Cartpole rewards: {xyz: 1.0}": "rewards.xyz: the task has no term 'xyz'; there are alive, angle, position",
+    "Cartpole rewards: {xyz: 1.0}": "rewards.xyz: the task has no term 'xyz'; available: alive, angle, position",
     "CartpolePixels camera: {witdh: 32}": "camera.witdh: CameraConfig has no such key; did you mean width?",
     # another type
     "Ant fall_height: low": "fall_height: expected a number, found a string ('low')",
