@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import rich.console
@@ -71,6 +73,9 @@ def echo_json(value: Any, indent: int | None = None) -> None:
 class Console(rich.console.Console):
     """Rich's console with rendered text made :func:`visible`; its own styles and cursor movements are unchanged."""
 
+    def on_broken_pipe(self) -> None:
+        raise  # to end_at_closed_pipe; rich would exit with 1
+
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(visible(text), **options)  # before it is measured
 
@@ -113,6 +118,16 @@ def print_wrapped(table: Table) -> None:
         column.min_width = max(size.maximum if column.no_wrap else size.minimum for size in sizes)
         least += column.min_width
     Console(width=max(terminal.width, least)).print(table, soft_wrap=True)
+
+
+@contextmanager
+def end_at_closed_pipe() -> Iterator[None]:
+    """Exit with 0 and without a message where the reader of the output has closed the pipe (``muster … | head``)."""
+    try:
+        yield
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard buffered output
+        sys.exit(0)
 
 
 class _Formatter(logging.Formatter):

@@ -114,7 +114,7 @@ def _hint(error: Exception, frame: FrameType) -> str:
         known = [*_names(frame.f_code), *frame.f_globals, *dir(builtins)]
     elif isinstance(error, ImportError) and (found := re.match(r"cannot import name '(\w+)'", str(error))):
         known, name = dir(sys.modules.get(str(error.name))), found[1]
-    near = nearest(name, known, " ", cutoff=0.6) if name and known else ""
+    near = nearest(name, known, " ") if name and known else ""
     return near.strip()
 
 

@@ -36,10 +36,9 @@ MISUSE = {
     ),
     "serve --port": "--port needs a value; see: muster serve --help",
     "list --json=5": "--json takes no value; see: muster list --help",
-    "list --state fail": "--state FAIL: unknown state; did you mean FAILED?",
-    "resume ant@3 --checkpoint 4": "--checkpoint 4: ant@3 names a checkpoint, too; leave one of them out",
+    "list --status fail": "--status FAIL: unknown status; did you mean FAILED?",
     "--server http://x keys list": "--server: muster keys works on this machine, without a controller; leave --server out",
-    "runs --search ant list": "--search: an option of muster runs alone; leave list out",
+    "runs --name ant list": "--name: an option of muster runs alone; leave list out",
     "list --server=": "--server: give the URL of a controller, such as http://127.0.0.1:8080",
     "keys list --server http://x": "--server: unknown option; see: muster keys list --help",
 }
@@ -56,6 +55,15 @@ def test_user_input_reaches_the_terminal_as_text(tmp_path: Path) -> None:
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "\x1b" not in done.stderr
 
 
+@pytest.mark.parametrize("typed", ["--help", "schema", "run --help"])
+def test_a_closed_pipe_ends_a_command_with_0_and_without_a_message(typed: str) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([MUSTER, *typed.split()], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("typed", ["", "models", "webhooks"])
 def test_a_group_without_a_command_shows_its_help_alone(tmp_path: Path, typed: str) -> None:
     done = call_muster(*typed.split(), home=tmp_path)
@@ -70,7 +78,7 @@ def commands() -> list[tuple[str, Any]]:
     ]
 
 
-SHARED = ("--json", "--dry-run", "--set", "--server", "--cpus", "--nodes", "--queue")
+SHARED = ("--json", "--dry-run", "--set", "--server", "--cpus", "--nodes", "--queue", "--overwrite", "--yes", "--store")
 
 
 def test_every_group_refuses_unknown_commands_alike_and_every_command_has_an_example_and_a_summary() -> None:
@@ -97,7 +105,12 @@ def test_an_option_has_one_spelling_and_one_form_in_all_commands_and_help_is_a_w
 
 def test_help_shows_flags_without_a_value_and_where_the_controller_is_named(tmp_path: Path) -> None:
     shown = call_muster("resume", "--help", home=tmp_path).stdout
-    assert "-f, --follow  " in shown and "--set KEY=VALUE " in shown and "--server URL " in shown and "<" not in shown
+    assert (
+        "-f, --follow / --no-follow  " in shown
+        and "--set KEY=VALUE " in shown
+        and "--server URL " in shown
+        and "<" not in shown
+    )
     root = call_muster("--help", home=tmp_path).stdout
     assert all(part in root for part in ("--server URL", "$MUSTER_URL", "$MUSTER_TOKEN", "muster --install-completion"))
 
