@@ -13,7 +13,7 @@ import pytest
 
 from orchestrator.cli.catalogue import ENTRIES, load
 from orchestrator.cli.misuse import CommandGroup
-from tests.conftest import MUSTER, call_muster
+from tests.conftest import MUSTER, REPOSITORY, call_muster
 
 PLUGIN = " (if a plug-in provides it, install the plug-in's package)"
 MISUSE = {
@@ -64,10 +64,19 @@ def test_a_closed_pipe_ends_a_command_with_0_and_without_a_message(typed: str) -
     assert (done.returncode, done.stderr) == (0, "")
 
 
-@pytest.mark.parametrize("typed", ["", "models", "webhooks"])
+@pytest.mark.parametrize("typed", ["", "aws"])
 def test_a_group_without_a_command_shows_its_help_alone(tmp_path: Path, typed: str) -> None:
     done = call_muster(*typed.split(), home=tmp_path)
     assert done.returncode == 2 and "Usage: muster" in done.stdout and done.stderr == ""
+
+
+def test_a_group_without_a_command_lists(tmp_path: Path) -> None:
+    assert [
+        name for name, group in commands() if "list" in getattr(group, "commands", {}) and group.no_args_is_help
+    ] == []
+    assert call_muster("keys", home=tmp_path).stdout == call_muster("keys", "list", home=tmp_path).stdout != ""
+    made = call_muster("keys", "create", "ada", home=tmp_path, MUSTER_DATABASE=str(tmp_path / "other.db"))
+    assert made.returncode == 0, made.stderr
 
 
 def commands() -> list[tuple[str, Any]]:
@@ -99,6 +108,9 @@ def test_an_option_has_one_spelling_and_one_form_in_all_commands_and_help_is_a_w
                 forms.setdefault(param.opts[0], set()).add((*param.opts, *param.secondary_opts, param.metavar))
             assert param.hidden or param.help[0].isupper() or param.help.startswith("postgresql"), (name, param.opts)
     assert {option: len(found) for option, found in forms.items()} == dict.fromkeys(SHARED, 1)
+    lacking = {name for name, command in own if "--json" not in str([each.opts for each in command.params])}
+    (listed,) = re.findall("All commands take `--json` but (.*), which", (REPOSITORY / "docs/jobs.md").read_text())
+    assert lacking == {*re.findall("`(.*?)`", listed)} | {"aws"}, "the group has no options"
     first = {name: command.params[0].metavar for name, command in own if command.params}
     assert {first[name] for name in ("resume", "clone", "evaluate", "export")} == {"RUN[@ITERATION|@best|@latest]"}
 
