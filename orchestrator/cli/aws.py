@@ -24,8 +24,10 @@ if TYPE_CHECKING:
 
 _STATUS = Resource({"": lambda row: row[0], " ": lambda row: row[1]}, whole=True)
 NameOption = Annotated[str, typer.Option("--stack-name", metavar="NAME", help="Name of the CloudFormation stack.")]
-RegionOption = Annotated[str | None, typer.Option(help="AWS region; by default that of your AWS configuration.")]
-ProfileOption = Annotated[str | None, typer.Option(help="Profile of your AWS configuration.")]
+RegionOption = Annotated[
+    str | None, typer.Option(metavar="REGION", help="AWS region; by default that of your AWS configuration.")
+]
+ProfileOption = Annotated[str | None, typer.Option(metavar="PROFILE", help="Profile of your AWS configuration.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -49,6 +51,7 @@ def up(
     ] = None,
     template: Annotated[Path | None, typer.Option(help="A template to use instead of Muster's own.")] = None,
     yes: YesOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Create or update the stack, and write $MUSTER_HOME/aws.json for the aws-batch engine."""
     parameters = dict(_pair(each) for each in parameter or [])
@@ -61,13 +64,14 @@ def up(
             f"{verb} stack {stack_name} in {stack.region}? It costs money from now on (a NAT gateway by the hour, the volume "
             "by what lies on it; instances only while jobs run)",
             abort=True,
+            err=as_json,
         )
     began = time.time() - 1
     made = stack.create(text, parameters)
     if made is None:
-        echo(f"stack {stack_name} is up to date")
+        echo(f"stack {stack_name} is up to date", err=as_json)
     else:
-        events = _follow(stack, made, began)
+        events = _follow(stack, made, began, as_json)
         found = stack.describe()
         state = found["StackStatus"] if found else "DELETE_COMPLETE"
         if state not in ("CREATE_COMPLETE", "UPDATE_COMPLETE"):
@@ -75,6 +79,9 @@ def up(
             raise ServerError(f"stack {stack_name} is in {state}: {why}; remove what is left with `muster aws down`")
     path = from_template.write_config(muster_home(), stack, os.environ.get("AWS_ENDPOINT_URL"))
     outputs = stack.outputs()
+    if as_json:
+        echo_json({"stack": stack_name, "region": stack.region, "config": str(path), "outputs": outputs}, indent=1)
+        return
     repository = outputs["RepositoryUri"]
     echo(f"""wrote {path}
 
@@ -91,6 +98,7 @@ def down(
     region: RegionOption = None,
     profile: ProfileOption = None,
     yes: YesOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Delete the stack: network, queue, images, logs, workstation. The volume with all runs is kept."""
     from_template, stack = _stack_module(), _stack(stack_name, region, profile)
@@ -104,14 +112,18 @@ def down(
             if jobs
             else ""
         )
-        typer.confirm(f"delete stack {stack_name} in {stack.region}? {ended}images and logs go; {stays}", abort=True)
+        question = f"delete stack {stack_name} in {stack.region}? {ended}images and logs go; {stays}"
+        typer.confirm(question, abort=True, err=as_json)
     began = time.time() - 1
-    events = _follow(stack, stack.delete(), began)
+    events = _follow(stack, stack.delete(), began, as_json)
     if stack.describe() is not None:
         raise ServerError(f"stack {stack_name} could not be deleted: {from_template.first_failure(events)}")
     config = config_path(muster_home())
     if config.exists() and f'"stack": "{stack_name}"' in config.read_text():
         config.unlink()
+    if as_json:
+        echo_json({"stack": stack_name, "region": stack.region, "fileSystem": volume})
+        return
     echo(f"stack {stack_name} is deleted; {stays}")
     if volume:
         echo(f"to delete that, too:  aws efs delete-file-system --region {stack.region} --file-system-id {volume}")
@@ -147,13 +159,13 @@ def status(
     _STATUS.show([*rows.items()])
 
 
-def _follow(stack: Stack, made: str, began: float) -> list[StackEvent]:
-    """Print the stack's events until it is stable."""
+def _follow(stack: Stack, made: str, began: float, err: bool) -> list[StackEvent]:
+    """Print the stack's events until it is stable, with ``err`` on standard error."""
     events = []
     for event in stack.follow(made, began):
         events.append(event)
         reason = f"  {event.reason}" if event.reason and event.is_failure else ""
-        echo(f"{event.time}  {event.status:<22} {event.resource}{reason}")
+        echo(f"{event.time}  {event.status:<22} {event.resource}{reason}", err)
     return events
 
 

@@ -16,6 +16,7 @@ from typer.models import CommandInfo, TyperInfo
 
 from orchestrator.cli.help import print_help, set_forms
 from orchestrator.cli.misuse import CommandGroup, in_place_of
+from orchestrator.cli.terminal import end_at_closed_pipe
 from orchestrator.domain.errors import UsageError
 from shared_store.contract.error_text import nearest
 from shared_store.contract.plugins import Command, PluginError, blamed, plugins
@@ -196,6 +197,14 @@ def _for_server(own: Callable[..., Any]) -> Callable[..., Any]:
 
 class Catalogue(CommandGroup):
     """A group that lists placeholders and runs the real commands."""
+
+    def make_context(self, *args: Any, **options: Any) -> Any:
+        with end_at_closed_pipe():  # of --help and --version
+            return super().make_context(*args, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        with end_at_closed_pipe():
+            return super().invoke(ctx)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, found, rest = super().resolve_command(ctx, args)  # refuses an unknown name with the nearest known ones

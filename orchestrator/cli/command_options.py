@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +19,7 @@ _REFERENCE = "RUN[@ITERATION|@best|@latest]"
 
 SpecArgument = Annotated[str, typer.Argument(metavar="SPEC", help="A job YAML, such as job_specs/cartpole.yaml.")]
 JobArgument = Annotated[str, typer.Argument(metavar="JOB", help=_JOB)]
-JobsArgument = Annotated[list[str], typer.Argument(metavar="JOB…", help=_JOB)]
+JobsArgument = Annotated[list[str], typer.Argument(metavar="JOB", help=_JOB)]
 RunArgument = Annotated[str, typer.Argument(metavar="RUN", help="A run; `muster runs` lists them.")]
 CheckpointArgument = Annotated[
     str,
@@ -40,8 +41,13 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Change a key of the spec: train.iterations=600. Repeatable."),
 ]
-NameOption = Annotated[str | None, typer.Option("--name", help="Name of the job and of its run; default: the spec's.")]
-QueueOption = Annotated[str | None, typer.Option("--queue", metavar="QUEUE", help="Job queue; default: the spec's.")]
+NameOption = Annotated[
+    str | None,
+    typer.Option("--name", metavar="NAME", help="Name of the job and of its run; default: that of the spec."),
+]
+QueueOption = Annotated[
+    str | None, typer.Option("--queue", metavar="QUEUE", help="Job queue; default: that of the spec or of the run.")
+]
 EngineOption = Annotated[
     str | None,
     typer.Option(
@@ -50,13 +56,15 @@ EngineOption = Annotated[
     ),
 ]
 NodesOption = Annotated[
-    int | None, typer.Option(min=1, help="Number of nodes; default: the spec's. A resumed run shares its worlds anew.")
+    int | None,
+    typer.Option(
+        min=1, help="Number of nodes, among which the worlds are divided; default: that of the spec or of the run."
+    ),
 ]
-FollowOption = Annotated[bool, typer.Option("--follow", "-f", help="Show progress until the job ends.")]
-DetachOption = Annotated[
+FollowOption = Annotated[
     bool,
     typer.Option(
-        "--follow/--no-follow", "-f/--detach", help="Show progress until the job ends, or return once it is submitted."
+        "--follow/--no-follow", "-f", help="Show progress until the job ends, or return once it is submitted."
     ),
 ]
 DryRunOption = Annotated[
@@ -81,6 +89,9 @@ StoreOption = Annotated[
 ]
 CpusOption = Annotated[
     float | None, typer.Option(min=0.1, help="CPU cores to allocate; by default all of the machine's.")
+]
+NamesOption = Annotated[
+    str | None, typer.Option("--name", metavar="PATTERN", help="Only those of this name, such as 'ant-*'.")
 ]
 SinceOption = Annotated[
     str | None, typer.Option(metavar="DURATION", help="Only what is newer than this: 90s, 10m, 2h or 1d.")
@@ -115,6 +126,11 @@ def split_model(reference: str) -> tuple[str, int | None]:
     if sign and not (version.isascii() and version.isdecimal() and 0 < len(version) < 10 and int(version) > 0):
         raise UsageError(f"{reference}: expected a version after @, such as {name}@1")
     return name, int(version) if sign else None
+
+
+def literal_part(pattern: str | None) -> str:
+    """The longest part of a pattern without wildcards, which the controller can search for."""
+    return max(re.split(r"\[.*?\]|[*?]", pattern or ""), key=len)
 
 
 def changes_of(changes: Sequence[str] | None, **values: tuple[str, object]) -> list[str]:

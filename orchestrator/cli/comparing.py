@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
 def compare(
     runs: Annotated[
         list[str],
-        typer.Argument(metavar="RUN…", help="Runs, or patterns in quotes such as 'ant-*'; at least two runs in all."),
+        typer.Argument(metavar="RUN", help="Runs, or patterns in quotes such as 'ant-*'; at least two runs in all."),
     ],
     output: Annotated[
         Path | None,

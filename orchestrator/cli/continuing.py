@@ -14,7 +14,6 @@ from orchestrator.cli.runs import chosen
 from orchestrator.cli.submitting import changes_of_run, queue_change, report, show_plan
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
-from orchestrator.domain.errors import UsageError
 
 _CLONES = """Examples:  muster clone ant-1f2e3d4c@best --name ant-fast --set train.config.rewards.forward=2.0 -f
 muster clone ant-1f2e3d4c@300 --name ant-long --set train.iterations=900 --nodes 2 --dry-run"""
@@ -29,7 +28,6 @@ def register(app: typer.Typer) -> None:
 
 def resume(
     source: options.CheckpointArgument,
-    checkpoint: Annotated[int | None, typer.Option(hidden=True)] = None,
     nodes: options.NodesOption = None,
     set_: options.SetOption = None,
     accept_changed_robot: options.AcceptOption = False,
@@ -47,14 +45,11 @@ def resume(
     job after a checkpoint. --store and --cpus are for this case.
     """
     run, reference = options.split_reference(source)
-    if reference is not None and checkpoint is not None:
-        raise UsageError(f"--checkpoint {checkpoint}: {source} names a checkpoint, too; leave one of them out")
     with found_or_own(store, cpus, [engine] if engine else ()) as (client, is_own):
         body = _body(client, run, set_, queue, engine, nodes, dry_run)
         if accept_changed_robot:
             body["set"].append("train.accept_changed_robot=true")
-        if reference is not None:
-            checkpoint = chosen(client, run, reference)["iteration"]
+        checkpoint = None if reference is None else chosen(client, run, reference)["iteration"]
         resumed = client.post(f"/api/runs/{named(run)}/resume", {**body, "checkpoint": checkpoint}, once=not dry_run)
         if dry_run:
             show_plan(client, resumed["definition"], resumed["queue"], as_json)
@@ -75,7 +70,7 @@ def resume(
 
 def clone(
     source: options.CheckpointArgument,
-    name: Annotated[str, typer.Option("--name", help="Name of the new run and of its job.")],
+    name: Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the new run and of its job.")],
     set_: options.SetOption = None,
     nodes: options.NodesOption = None,
     queue: options.QueueOption = None,

@@ -47,13 +47,15 @@ def evaluate(
             help="Change the worlds (config.randomize.friction=[0.4, 0.6]) or a key of the job (resources.cpus=4). Repeatable.",
         ),
     ] = None,
-    name: Annotated[str | None, typer.Option("--name", help="Name of the job; default: evaluate-RUN.")] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", metavar="NAME", help="Name of the job; default: evaluate-RUN.")
+    ] = None,
     accept_changed_robot: options.AcceptOption = False,
     queue: options.QueueOption = None,
     engine: options.EngineOption = None,
     store: options.StoreOption = None,
     cpus: options.CpusOption = None,
-    follow: options.DetachOption = True,
+    follow: options.FollowOption = True,
     dry_run: options.DryRunOption = False,
     as_json: options.JsonOption = False,
 ) -> None:

@@ -33,13 +33,19 @@ def register(app: typer.Typer) -> None:
 def export(
     source: options.CheckpointArgument,
     output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Copy the bundle to this directory, which must not exist.")
+        Path | None, typer.Option("--output", "-o", metavar="DIRECTORY", help="Copy the bundle to this directory.")
     ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing bundle.")] = False,
     episodes: Annotated[
         int, typer.Option(min=0, help="Judge the bundle on at least this many episodes; 0: compare only its actions.")
     ] = 16,
     worlds: Annotated[int, typer.Option(min=1, help="Number of simulated worlds in the comparison.")] = 16,
-    set_: options.SetOption = None,
+    set_: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Change a key of the job, such as resources.gpus=1. Repeatable."
+        ),
+    ] = None,
     accept_changed_robot: options.AcceptOption = False,
     store: options.StoreOption = None,
     as_json: options.JsonOption = False,
@@ -50,7 +56,10 @@ def export(
     only if its policy acts like the trained one on recorded observations (within 1e-5) and performs as well in the same simulated worlds.
     """
     if output is not None and output.exists():
-        raise UsageError(f"-o {output}: exists already; name a new directory")
+        if not (output / bundles.MANIFEST).is_file():
+            raise UsageError(f"-o {output}: it exists and is not a bundle; name a new directory")
+        if not overwrite:
+            raise UsageError(f"-o {output}: it exists; --overwrite replaces it")
     run, reference = options.split_reference(source)
     with controller(store, None) as connect:
         client = connect()
@@ -63,7 +72,7 @@ def export(
         code = see_through(client, job, await_end if as_json else follow_main)
         if code == 0:
             place = Store(client.get("/api/capacity")["store"]).run(run).exports / checkpoint["name"]
-            facts = _checks(place, output)
+            facts = _checks(place, output, overwrite)
             if as_json:
                 echo_json({"run": run, "iteration": checkpoint["iteration"], "jobId": job, **facts}, indent=1)
             elif facts["report"] is None:
@@ -77,7 +86,7 @@ def _elsewhere(place: Path) -> str:
     return f"the bundle is in the controller's store, {place}, which is not on this machine"
 
 
-def _checks(place: Path, output: Path | None) -> dict[str, Any]:
+def _checks(place: Path, output: Path | None, overwrite: bool) -> dict[str, Any]:
     """Copy the bundle. Raises ServerError if it can't be copied.
 
     Returns:
@@ -91,7 +100,7 @@ def _checks(place: Path, output: Path | None) -> dict[str, Any]:
         report = read_json(place / bundles.REPORT) or {}
         files = bundles.verify(place)["files"]
         if output is not None:
-            bundles.copy(place, output)
+            bundles.copy(place, output, overwrite)
     except (OSError, ValueError, bundles.DamagedBundle) as error:
         raise ServerError(str(error)) from None
     size = sum(entry["size"] for entry in files.values())

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from orchestrator.cli.terminal import Console
 
-_FORMS = {int: "N", float: "NUMBER", Path: "PATH"}
+_FORMS = {int: "N", float: "NUMBER", Path: "FILE"}
 _WIDEST = 36
 """Columns for the names of options."""
 _LINE_END = re.compile(r"(?<!\n)\n(?!\n)")
@@ -20,14 +20,13 @@ _LINE_END = re.compile(r"(?<!\n)\n(?!\n)")
 
 
 def set_forms(params: list[Any]) -> None:
-    """Name the form of each parameter's value: ``N``, ``PATH``, for texts the option's name; nothing of a flag."""
+    """Name the form of each parameter's value: ``N``, ``FILE``, ``TEXT``; nothing of a flag."""
     for param in params:
         if param.param_type_name == "argument":
             param.metavar = param.metavar or param.name.upper()
             param.display_type_rich = lambda ctx: ""
         elif param.metavar is None:
-            name = param.name.strip("_").upper().replace("_", "-")
-            param.metavar = "" if param.is_flag else _FORMS.get(param.type_descriptor.annotation, name)
+            param.metavar = "" if param.is_flag else _FORMS.get(param.type_descriptor.annotation, "TEXT")
 
 
 def print_help(command: Any, ctx: Any, _formatter: object = None) -> None:

@@ -42,6 +42,7 @@ def register(app: typer.Typer) -> None:
     group = make_group(
         "Manage the access keys of this home directory's server.\n\nAWS clients use a key as a key pair, muster as MUSTER_TOKEN.",
         "Example:  muster keys create alice --queue robots",
+        list_keys,
     )
     group.command(epilog="Example:  muster keys create alice --queue robots")(create)
     group.command("list", epilog="Example:  muster keys list --json | jq '.[].name'")(list_keys)
@@ -59,8 +60,9 @@ def create(
     share: Annotated[
         str | None,
         typer.Option(
+            metavar="NAME",
             help="Share identifier of its jobs in queues with a fair-share policy; several keys may have one. By default the letters and "
-            "digits of its name."
+            "digits of its name.",
         ),
     ] = None,
     database: DatabaseOption = None,

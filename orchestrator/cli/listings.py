@@ -38,6 +38,7 @@ class Resource:
         blank: Shown in an empty cell.
         problem: Key of a row that can't be read for why, and words before that, if any.
         whole: Print each row on a line of its own, whatever the terminal's width.
+        width: At which rows wrap for another program than a terminal; 0: nowhere.
     """
 
     columns: Mapping[str, Cell]
@@ -49,6 +50,7 @@ class Resource:
     blank: str = "-"
     problem: tuple[str, str] = ("problem", "can't be read")
     whole: bool = False
+    width: int = 0
 
     def table(self, rows: Sequence[Row]) -> Table:
         """The rows as a table. One that lacks what a column needs has its :attr:`problem` in the last column."""
@@ -87,8 +89,10 @@ class Resource:
         elif rows:
             if self.title:
                 echo(f"\n{self.title}")
-            print_table = print_rows if self.whole else print_wrapped if self.folded else print_cut
-            print_table(self.table(rows))
+            if self.folded and not self.whole:
+                print_wrapped(self.table(rows), self.width)
+            else:
+                (print_rows if self.whole else print_cut)(self.table(rows))
         elif self.empty:
             echo(self.empty)
 

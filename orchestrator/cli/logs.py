@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 from datetime import UTC, datetime, timedelta
@@ -65,8 +64,8 @@ def logs(
                 for line in lines
                 if line["time"] >= oldest and pattern.search(line["text"])
             ]
-            if shown and not _printed("\n".join(shown)):
-                return
+            if shown:
+                echo_raw("\n".join(shown))
         if is_empty:
             options = {"node": node, "rank": rank, "attempt": attempt}
             part = ", ".join(f"{name} {value}" for name, value in options.items() if value is not None)
@@ -104,16 +103,6 @@ def _children_hint(client: Client, job: str) -> str:
     child = next((each["index"] for each in found["children"] if each["status"] == "FAILED"), 0)
     title = reasons.named(found["name"], found["id"])
     return f"{title} is an array, whose children have the logs, such as: muster logs {job}:{child}"
-
-
-def _printed(text: str) -> bool:
-    """Print a line; False if the reader closed the pipe (``muster logs … | head``)."""
-    try:
-        echo_raw(text)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard buffered output
-        return False
-    return True
 
 
 def _format(line: dict[str, Any], colour: bool, raw: bool) -> str:

@@ -68,10 +68,11 @@ def make_group(
 
 def _unless_subcommand(default: Callable[..., None]) -> Callable[..., None]:
     def callback(ctx: typer.Context, **values: Any) -> None:
+        own = {param.name: param.opts[0] for param in ctx.command.params if param.name in values}
         if ctx.invoked_subcommand is None:
             default(**values)
-        elif wrong := [name for name, value in values.items() if value]:
-            raise UsageError(f"--{wrong[0]}: an option of {ctx.command_path} alone; leave {ctx.invoked_subcommand} out")
+        elif wrong := [opt for name, opt in own.items() if "COMMANDLINE" in str(ctx.get_parameter_source(name))]:
+            raise UsageError(f"{wrong[0]}: an option of {ctx.command_path} alone; leave {ctx.invoked_subcommand} out")
 
     return in_place_of(
         default, callback, inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)

@@ -44,6 +44,7 @@ def register(app: typer.Typer) -> None:
     group = make_group(
         "Register, list, show, compare and verify exported policies.\n\nVersions are immutable.",
         _EXAMPLES,
+        MODELS.lister("List the newest version of each model."),
     )
     group.command("register", epilog="Example:  muster models register ant-1f2e3d4c@best --name ant")(register_model)
     MODELS.add_list(group, "List the newest version of each model.", "Example:  muster models list --json")
@@ -55,7 +56,9 @@ def register(app: typer.Typer) -> None:
 
 def register_model(
     source: options.CheckpointArgument,
-    name: Annotated[str, typer.Option("--name", help="Name of the model; its versions count up from 1.")],
+    name: Annotated[
+        str, typer.Option("--name", metavar="NAME", help="Name of the model; its versions count up from 1.")
+    ],
     again: Annotated[
         bool, typer.Option("--again", help="Register a checkpoint again that the model already has.")
     ] = False,

@@ -76,7 +76,7 @@ def list_queues(as_json: JsonOption = False) -> None:
 
 
 def show(
-    name: Annotated[str, typer.Argument(help="A queue.")],
+    name: Annotated[str, typer.Argument(metavar="QUEUE", help="A queue.")],
     as_json: JsonOption = False,
 ) -> None:
     """Show a queue's waiting jobs in the order in which they will start, and why each waits."""

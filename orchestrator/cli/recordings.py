@@ -27,12 +27,15 @@ from orchestrator.spec.sections import Resources, Retry
 from shared_store.process.tether import start_tied
 
 _FILES = (".mcap", ".partial", ".rrd")
+_FILMS = """Examples:  muster render ant-1f2e3d4c -o gait.gif --seconds 6
+muster render ant-1f2e3d4c@best -o gait.mp4 --worlds 1 --size 1280x720
+muster render ant-1f2e3d4c@300 -o moments.png"""
 _VIEWER = "worker.telemetry.live_view"
 
 
 def register(app: typer.Typer) -> None:
     app.command(epilog="Example:  muster record ant-1f2e3d4c@best -o ant.mcap --worlds 4 --episodes 2")(record)
-    app.command(epilog="Example:  muster render ant-1f2e3d4c -o gait.gif --seconds 6")(render)
+    app.command(epilog=_FILMS)(render)
     app.command(
         epilog="Examples:  muster view cartpole   muster view ant-1f2e3d4c@best --worlds 2   muster view ant.mcap --port 9100"
     )(view)
@@ -144,7 +147,10 @@ def view(
         typer.Option("--browser/--no-browser", help="Open the page; by default only with a terminal and a display."),
     ] = None,
     memory: Annotated[
-        str, typer.Option(help="Memory for data of pages opened later, such as 1GB; beyond it the oldest data goes.")
+        str,
+        typer.Option(
+            metavar="SIZE", help="Memory for data of pages opened later, such as 1GB; beyond it the oldest data goes."
+        ),
     ] = "256MB",
     accept_changed_robot: options.AcceptOption = False,
     store: options.StoreOption = None,

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from orchestrator.cli.command_options import JsonOption, RunArgument, YesOption
+from orchestrator.cli.command_options import JsonOption, NamesOption, RunArgument, YesOption, literal_part
 from orchestrator.cli.listings import Resource, date, date_ms, mebibytes, number, scored
 from orchestrator.cli.misuse import make_group
 from orchestrator.cli.terminal import echo, echo_json
@@ -35,7 +36,7 @@ RUNS = Resource(
         "CHECKPOINTS": lambda run: run["checkpoints"],
         "NEWEST": lambda run: Path(run["checkpoint"] or "").name,
         "LAST JOB": lambda run: _last_job(run).get("id", "")[:8],
-        "STATE": lambda run: _last_job(run).get("status"),
+        "STATUS": lambda run: _last_job(run).get("status"),
         "OWNER": lambda run: run["owner"],
         "QUEUE": "queue",
         "CREATED": lambda run: date_ms(run["created"]),
@@ -60,10 +61,10 @@ CHECKPOINTS = Resource(
 def register(app: typer.Typer) -> None:
     group = make_group(
         "List, archive and delete the runs of the store.\n\nOld runs that hold nothing but logs go by themselves, as `muster gc --help` says.",
-        "Examples:  muster runs --search ant   then   muster runs archive ant-1f2e3d4c",
+        "Examples:  muster runs --name 'ant-*'   then   muster runs archive ant-1f2e3d4c",
         list_runs,
     )
-    group.command("list", epilog="Example:  muster runs list --search ant")(list_runs)
+    group.command("list", epilog="Example:  muster runs list --name 'ant-*'")(list_runs)
     group.command(epilog="Examples:  muster runs archive ant-1f2e3d4c   and   muster runs archive ant-1f2e3d4c --undo")(
         archive
     )
@@ -73,16 +74,18 @@ def register(app: typer.Typer) -> None:
 
 
 def list_runs(
-    search: Annotated[str, typer.Option(help="Part of the name.")] = "",
+    name: NamesOption = None,
     archived: Annotated[bool, typer.Option("--archived", help="List the archived runs instead.")] = False,
     as_json: JsonOption = False,
 ) -> None:
     """List the runs that you may see, by name, each with its newest checkpoint and its last job."""
     with Client.connect() as client:
-        found = all_runs(client, search=search, archived=str(archived).lower())
+        matching = all_runs(client, search=literal_part(name), archived=str(archived).lower())
+    found = [run for run in matching if name is None or fnmatchcase(run["run"], name)]
     RUNS.show(found, as_json)
     if not found and not as_json:
-        echo("no run is archived" if archived else "no run; `muster runs --archived` lists archived ones")
+        what = f"no run {'is archived' if archived else 'exists'}" if name is None else f"--name {name}: no run matches"
+        echo(what if archived else f"{what}; `muster runs --archived` lists archived runs")
 
 
 def all_runs(client: Client, **query: Any) -> list[dict[str, Any]]:

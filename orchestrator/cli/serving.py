@@ -64,7 +64,7 @@ def run(
     store: options.StoreOption = None,
     cpus: options.CpusOption = None,
     inherit: InheritOption = None,
-    follow_: options.DetachOption = True,
+    follow_: options.FollowOption = True,
     dry_run: options.DryRunOption = False,
     as_json: options.JsonOption = False,
 ) -> None:
@@ -103,7 +103,11 @@ def have_inherited(names: Sequence[str] | None) -> None:
 
 def serve(
     host: Annotated[
-        str, typer.Option(help="Address to listen on; any but loopback requires a key (muster keys) or MUSTER_TOKEN.")
+        str,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Address to listen on; any but loopback requires a key (muster keys) or MUSTER_TOKEN.",
+        ),
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=0, max=65535, help="Port to listen on; 0: any free port.")] = 8080,
     store: options.StoreOption = None,
@@ -117,28 +121,32 @@ def serve(
     retention: Annotated[
         str | None,
         typer.Option(
+            metavar="DURATION|off",
             help="Time to keep ended jobs, their logs, and runs that hold nothing else, such as 90d; off: without end. By default 90d for "
-            "jobs of the Batch API, without end for others; a queue's tag muster:retention takes precedence."
+            "jobs of the Batch API, without end for others; a queue's tag muster:retention takes precedence.",
         ),
     ] = None,
     min_free: Annotated[
         str | None,
         typer.Option(
+            metavar="SIZE|PERCENT",
             help="Free space of store and database below which no gang starts: 1GiB or 5%; 0: no limit. By default 1GiB, or 5% of a "
-            "small volume."
+            "small volume.",
         ),
     ] = None,
     lost_after: Annotated[
         str,
         typer.Option(
+            metavar="DURATION",
             help="Time after which a node is lost that alone is silent on the bus, such as 5m, while its engine says that it runs. Nodes "
-            "that fall silent together are waited for, since the controller may be cut off."
+            "that fall silent together are waited for, since the controller may be cut off.",
         ),
     ] = "120s",
     squeue_interval: Annotated[
         str | None,
         typer.Option(
-            help="Time between two calls of squeue, such as 60s. By default 1s with at most 10 gangs, else 30s."
+            metavar="DURATION",
+            help="Time between two calls of squeue, such as 60s. By default 1s with at most 10 gangs, else 30s.",
         ),
     ] = None,
     rate_limit: Annotated[
@@ -147,7 +155,8 @@ def serve(
     trust_proxy: Annotated[
         list[str] | None,
         typer.Option(
-            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are trusted. Repeatable."
+            metavar="ADDRESS",
+            help="Address or network of a reverse proxy whose X-Forwarded-For and X-Forwarded-Proto are trusted. Repeatable.",
         ),
     ] = None,
     submit_rate_limit: Annotated[
@@ -156,21 +165,30 @@ def serve(
     secrets: Annotated[
         str | None,
         typer.Option(
+            metavar="FILE|env",
             help="Source of the secrets that jobs name: a JSON file of names and values, or env for variables MUSTER_SECRET_<name>. By "
-            "default such jobs are refused."
+            "default such jobs are refused.",
         ),
     ] = None,
     webhooks: Annotated[
         str | None,
-        typer.Option(help="JSON file of webhooks, which replaces those in the database; see `muster webhooks --help`."),
+        typer.Option(
+            metavar="FILE",
+            help="JSON file of webhooks, which replaces those in the database; see `muster webhooks --help`.",
+        ),
     ] = None,
     account_id: Annotated[
         str | None,
-        typer.Option(help="AWS account in all ARNs, 12 digits. The first `muster serve` settles it; default: zeros."),
+        typer.Option(
+            metavar="ACCOUNT",
+            help="AWS account in all ARNs, 12 digits. The first `muster serve` settles it; default: zeros.",
+        ),
     ] = None,
     region: Annotated[
         str | None,
-        typer.Option(help="AWS region in all ARNs. The first `muster serve` settles it; default: us-east-1."),
+        typer.Option(
+            metavar="REGION", help="AWS region in all ARNs. The first `muster serve` settles it; default: us-east-1."
+        ),
     ] = None,
     inherit: InheritOption = None,
 ) -> None:

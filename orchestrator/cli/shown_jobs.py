@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -12,7 +11,14 @@ from typing import Annotated, Any
 import typer
 from rich.text import Text
 
-from orchestrator.cli.command_options import JobArgument, JsonOption, SinceOption, seconds_since
+from orchestrator.cli.command_options import (
+    JobArgument,
+    JsonOption,
+    NamesOption,
+    SinceOption,
+    literal_part,
+    seconds_since,
+)
 from orchestrator.cli.jobs import owner_of
 from orchestrator.cli.listings import Resource, date_ms, duration, number, scored, show_facts
 from orchestrator.cli.progress import describe_best, shown_metrics
@@ -78,7 +84,7 @@ JOBS = Resource(
 def register(app: typer.Typer) -> None:
     app.command(
         "list",
-        epilog="Examples:  muster list --state RUNNING --mine     muster list --name 'ant-*' --since 2d     "
+        epilog="Examples:  muster list --status RUNNING --mine     muster list --name 'ant-*' --since 2d     "
         "muster list --json | jq '.[].jobId'",
     )(list_jobs)
     app.command(epilog="Example:  muster show ant")(show)
@@ -88,12 +94,11 @@ def list_jobs(
     all_: Annotated[
         bool, typer.Option("--all", "-a", help="List all jobs, not just the newest 20 without automatic evaluations.")
     ] = False,
-    state: Annotated[
-        list[str] | None, typer.Option(metavar="STATE", help="Only jobs in this state, such as RUNNING. Repeatable.")
+    status: Annotated[
+        list[str] | None,
+        typer.Option(metavar="STATUS", help="Only jobs with this status, such as RUNNING. Repeatable."),
     ] = None,
-    name: Annotated[
-        str | None, typer.Option("--name", metavar="PATTERN", help="Only jobs of this name, such as 'ant-*'.")
-    ] = None,
+    name: NamesOption = None,
     run: Annotated[str | None, typer.Option(metavar="RUN", help="Only jobs of this run.")] = None,
     queue: Annotated[str | None, typer.Option("--queue", metavar="QUEUE", help="Only jobs of this queue.")] = None,
     since: SinceOption = None,
@@ -106,16 +111,15 @@ def list_jobs(
     """
     age = seconds_since(since)
     oldest = 0 if age is None else (time.time() - age) * 1000
-    literal = max(re.split(r"\[.*?\]|[*?]", name or ""), key=len)  # of the pattern, for the controller's search
 
     def fits(job: Mapping[str, Any]) -> bool:
         has_name = name is None or fnmatchcase(job["name"], name)
         return has_name and run in (None, job["run"]) and (job.get("isOwn", True) or not mine)
 
-    states = [each.upper() for each in state or ()]
-    if wrong := [each for each in states if each not in set(Status)]:
-        raise UsageError(f"--state {wrong[0]}: unknown state; {nearest(wrong[0], Status)}")
-    query = {"status": states or None, "queue": queue, "search": run or literal or None}
+    statuses = [each.upper() for each in status or ()]
+    if wrong := [each for each in statuses if each not in set(Status)]:
+        raise UsageError(f"--status {wrong[0]}: unknown status; {nearest(wrong[0], Status)}")
+    query = {"status": statuses or None, "queue": queue, "search": run or literal_part(name) or None}
     with Client.connect() as client:
         jobs = _newest(client, query, fits, oldest, None if all_ else _NEWEST, automatic=as_json)
         if (
@@ -128,7 +132,7 @@ def list_jobs(
         echo_json(jobs if all_ else jobs[:_NEWEST], indent=1)
         return
     shown = jobs if all_ else [each for each in jobs if not each[_AUTOMATIC]][:_NEWEST]
-    is_filtered = any((state, name, run, queue, since, mine))
+    is_filtered = any((status, name, run, queue, since, mine))
     empty = replace(JOBS, empty="no job fits; without these options `muster list` lists all") if is_filtered else JOBS
     if shown or not jobs:
         empty.show(shown)

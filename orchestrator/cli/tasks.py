@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from importlib.util import find_spec
 from typing import Annotated, Any
 
@@ -16,6 +17,8 @@ from orchestrator.cli.listings import Resource
 from orchestrator.cli.terminal import Console, echo
 from orchestrator.domain.errors import ServerError, SpecError
 
+_WIDTH = 120
+"""Columns of all about one task, where the output is not a terminal."""
 TASKS = Resource(
     {
         "TASK": "name",
@@ -31,6 +34,7 @@ TASKS = Resource(
 NUMBERS = Resource(
     {"": lambda row: row[0], " ": lambda row: ", ".join(f"{value:g}" for value in row[1])},
     folded=(" ",),
+    width=_WIDTH,
     title="NUMBERS of train.config.numbers and train.config.curriculum",
 )
 
@@ -50,16 +54,20 @@ def tasks(
     Change the weights of reward terms in a job's YAML: train: {config: {rewards: {forward: 2.0}}}
     """
     found = ask_worker("worker.tasks", [name] if name else [], "tasks can't be listed")
-    TASKS.show(found, as_json)
+    replace(TASKS, width=_WIDTH if name else 0).show(found, as_json)
     if not name or as_json:
         return
-    console = Console(highlight=False, soft_wrap=not sys.stdout.isatty())
-    for kind in ("observations", "actions"):
-        console.print(f"\n{kind.upper()}\n{', '.join(found[0][kind])}", markup=False)
-    if robots := found[0]["robots"]:
-        console.print("\nROBOTS\n" + "\n".join(robots), markup=False)
+    names = ", ".join(found[0]["actions"])
+    console = Console(highlight=False, width=None if sys.stdout.isatty() else _WIDTH)
+    for title, lines in {
+        "NAMES OF OBSERVATIONS": [", ".join(found[0]["observations"])],
+        "NAMES OF ACTIONS": [names],
+        "ROBOTS": found[0]["robots"],
+    }.items():
+        if lines:
+            console.print("\n".join([f"\n{title}", *lines]), markup=False)
     for section, rows in found[0].get("tables", {}).items():
-        terms(section, rows).show(rows)
+        terms(section, rows).show([row | {"joints": ""} if row.get("joints") in ("", names) else row for row in rows])
     NUMBERS.show([*(found[0].get("numbers") or {}).items()])
 
 
@@ -71,6 +79,7 @@ def terms(section: str, rows: Sequence[dict[str, str]]) -> Resource:
         optional=columns,
         folded=[column for column in columns if column != "name"],
         title=section.upper(),
+        width=_WIDTH,
         blank="",
     )
 

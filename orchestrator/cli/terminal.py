@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import rich.console
@@ -71,6 +73,9 @@ def echo_json(value: Any, indent: int | None = None) -> None:
 class Console(rich.console.Console):
     """Rich's console with rendered text made :func:`visible`; its own styles and cursor movements are unchanged."""
 
+    def on_broken_pipe(self) -> None:
+        raise  # to end_at_closed_pipe; rich would exit with 1
+
     def render_str(self, text: str, **options: Any) -> Text:
         return super().render_str(visible(text), **options)  # before it is measured
 
@@ -81,9 +86,12 @@ class Console(rich.console.Console):
 
 def print_rows(table: Table) -> None:
     """Print each row of a table as one line, with nothing cut and no spaces at its end: to be read whole, or by another program."""
-    wide = Console(width=_WIDEST)
-    with wide.capture() as captured:
-        wide.print(table, soft_wrap=True)
+    _print_lines(Console(width=_WIDEST), table)
+
+
+def _print_lines(console: Console, table: Table) -> None:
+    with console.capture() as captured:
+        console.print(table, soft_wrap=True)
     echo_raw("\n".join(line.rstrip() for line in captured.get().splitlines()))
 
 
@@ -101,18 +109,28 @@ def print_cut(table: Table) -> None:
     Console(width=max(console.width, taken + len("REASON"))).print(table, soft_wrap=True)
 
 
-def print_wrapped(table: Table) -> None:
-    """On a terminal, wrap cells between words but never within a name; for another program, one line per row."""
-    if not sys.stdout.isatty():
+def print_wrapped(table: Table, width: int = 0) -> None:
+    """On a terminal, wrap cells between words but never within a name; for another program wrap at ``width``, or print one line per row."""
+    if not sys.stdout.isatty() and not width:
         print_rows(table)
         return
-    terminal, wide = Console(), Console(width=_WIDEST)
+    terminal, wide = Console(width=None if sys.stdout.isatty() else width), Console(width=_WIDEST)
     least = 2 * len(table.columns)
     for column in table.columns:
         sizes = [wide.measure(cell) for cell in (column.header, *column.cells)]
         column.min_width = max(size.maximum if column.no_wrap else size.minimum for size in sizes)
         least += column.min_width
-    Console(width=max(terminal.width, least)).print(table, soft_wrap=True)
+    _print_lines(Console(width=max(terminal.width, least)), table)
+
+
+@contextmanager
+def end_at_closed_pipe() -> Iterator[None]:
+    """Exit with 0 and without a message where the reader of the output has closed the pipe (``muster … | head``)."""
+    try:
+        yield
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # discard buffered output
+        sys.exit(0)
 
 
 class _Formatter(logging.Formatter):

@@ -38,7 +38,8 @@ def register(app: typer.Typer) -> None:
         "List and test the webhooks that report the end of jobs.\n\nConfigure them with `muster serve --webhooks FILE`, a JSON "
         'object by name: {"chat": {"url": "https://chat.example/hooks/muster", "secret": "whsec_…", "statuses": ["FAILED"]}}. The database keeps them, '
         "sealed, for later starts; another file replaces them.",
-        "Examples:  muster webhooks test chat   then   muster webhooks list",
+        "Examples:  muster webhooks test chat   then   muster webhooks",
+        list_webhooks,
     )
     group.command("list", epilog="Example:  muster webhooks list --json | jq '.[].failed'")(list_webhooks)
     group.command(epilog="Example:  muster webhooks test chat")(test)

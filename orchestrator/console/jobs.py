@@ -40,7 +40,7 @@ GROUPS: Mapping[str, tuple[Status, ...]] = {
     "succeeded": (Status.SUCCEEDED,),
     "failed": (Status.FAILED,),
 }
-"""States as the page's filter has them."""
+"""Statuses by the name of the page's filter."""
 _recent = Recent()
 
 
@@ -48,7 +48,7 @@ _recent = Recent()
 class _Choice:
     """The filter and the place of the page, as an address gives them; empty for all, and for the first page."""
 
-    state: Annotated[str, Query(max_length=20)] = ""
+    status: Annotated[str, Query(max_length=20)] = ""
     queue: Annotated[str, Query(max_length=128)] = ""
     search: Annotated[str, Query(max_length=_LONGEST)] = ""
     after: Annotated[str, Query(max_length=_LONGEST)] = ""
@@ -56,7 +56,7 @@ class _Choice:
 
     @property
     def filter(self) -> dict[str, str]:
-        return {"state": self.state, "queue": self.queue, "search": self.search}
+        return {"status": self.status, "queue": self.queue, "search": self.search}
 
     @property
     def selection(self) -> JobSelection:
@@ -97,7 +97,7 @@ def jobs_stream(request: Request, choice: _Chosen) -> Response:
 def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     """Stop the jobs that were chosen, or all that the filter finds."""
     controller, actor = controller_of(request), actor_of(request)
-    chosen = {each: form.one(each) for each in ("state", "queue", "search")}
+    chosen = {each: form.one(each) for each in ("status", "queue", "search")}
     if form.one("all") == "yes":
         found = _selection(**chosen)
         with controller.database.session() as session:
@@ -118,12 +118,12 @@ def stop(request: Request, form: Form = Depends(sent_form)) -> Response:
     return done(request, _address(**chosen), f"{several} asked to stop")
 
 
-def _selection(state: str, queue: str, search: str) -> JobSelection:
-    if state not in GROUPS:
-        raise ClientError(f"state {state!r} is not known; it is one of {', '.join(filter(None, GROUPS))}")
+def _selection(status: str, queue: str, search: str) -> JobSelection:
+    if status not in GROUPS:
+        raise ClientError(f"status {status!r} is not known; it is one of {', '.join(filter(None, GROUPS))}")
     if len(search) > _LONGEST:
         raise ClientError(f"the text to search for has more than {_LONGEST} characters")
-    return JobSelection(GROUPS[state], queue, search)
+    return JobSelection(GROUPS[status], queue, search)
 
 
 def _parts(controller: Controller, actor: Actor, choice: _Choice) -> dict[str, Any]:
@@ -141,10 +141,10 @@ def _read_parts(controller: Controller, actor: Actor, choice: _Choice) -> dict[s
         "tabs": [
             (
                 name,
-                _address(**{**choice.filter, "state": name}),
-                f"{sum(counts.get(each, 0) for each in states or Status)}{more}",
+                _address(**{**choice.filter, "status": name}),
+                f"{sum(counts.get(each, 0) for each in statuses or Status)}{more}",
             )
-            for name, states in GROUPS.items()
+            for name, statuses in GROUPS.items()
         ],
         "pages": {
             "newest": address() if choice.after or choice.before else "",

@@ -245,7 +245,7 @@ def _absent(controller: Controller, actor: Actor, name: str) -> ClientError:
             return ClientError(f"{name} is a job, not a run; its run is {named.run}", 404)
     runs = [each.name for each in visible_runs(controller, actor, most=_COMPARED)]
     others = "`muster runs` lists the runs" if runs else "no run exists yet"
-    hint = nearest(name, runs, others, cutoff=0.3)
+    hint = nearest(name, runs, others, cutoff=0.5)  # a run's name has an id at its end
     return ClientError(f"run {name} does not exist in {controller.access.store.path}; {hint}", 404)
 
 

@@ -19,7 +19,7 @@ def nearest(name: str, names: Iterable[str], what: str = "there are") -> str:
         what: Begins the list of names.
     """
     known = sorted(names)
-    close = difflib.get_close_matches(name, known, 1, 0.5)
+    close = difflib.get_close_matches(name, known, n=1)
     if close:
         return f"did you mean {close[0]}?"
     return f"{what}: {', '.join(known[:8])}{', …' if len(known) > 8 else ''}" if known else f"{what} none"

@@ -48,7 +48,9 @@ def race_or_evaluate(
     track: Annotated[
         list[str] | None,
         typer.Option(
-            help="Track to use instead of the training's; laps use several in turn. Repeatable.", rich_help_panel=_RACE
+            metavar="TRACK",
+            help="Track to use instead of the training's; laps use several in turn. Repeatable.",
+            rich_help_panel=_RACE,
         ),
     ] = None,
     output: Annotated[
@@ -56,21 +58,26 @@ def race_or_evaluate(
         typer.Option(
             "--output",
             "-o",
+            metavar="DIRECTORY",
             help="Copy the SimTrace files of the race, and those of the training, into this directory, as log tools expect them.",
             rich_help_panel=_RACE,
             show_default=False,
         ),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace existing files of a race.", rich_help_panel=_RACE)
+    ] = False,
 ) -> None:
     """Evaluate a checkpoint, or have it drive a race. Raises what :func:`.follow_evaluation` raises."""
     rules = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None, "output": output}
+    rules["overwrite"] = overwrite or None
     _refuse_mixed(race, {"episodes": arguments["episodes"], "worlds": arguments["worlds"]}, rules)
     if not race:
         evaluate(**arguments)
         return
     for existing in () if output is None else (output / each for each in (SIM_TRACE, *BESIDE)):
-        if existing.exists():
-            raise UsageError(f"-o {output}: {existing} exists; name another directory")
+        if existing.exists() and not overwrite:
+            raise UsageError(f"-o {output}: {existing} exists; --overwrite replaces it")
     section = {
         "seed": arguments["seed"],
         "trials": trials,
@@ -116,9 +123,14 @@ def _copy(run: Path, evaluation: str, output: Path, quiet: bool) -> None:
         shutil.copytree(made, hidden)
         if (run / trained).is_dir():
             shutil.copytree(run / trained, hidden / trained)
+        shutil.rmtree(output / SIM_TRACE, ignore_errors=True)  # it exists only with --overwrite
         for each in list(hidden.iterdir()):
-            each.rename(output / each.name)
-        hidden.rmdir()
+            target = output / each.name
+            if target.is_dir():
+                shutil.copytree(each, target, dirs_exist_ok=True)
+            else:
+                each.rename(target)
+        shutil.rmtree(hidden)
     except OSError as error:
         shutil.rmtree(hidden, ignore_errors=True)
         raise ServerError(

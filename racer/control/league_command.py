@@ -12,6 +12,7 @@ import typer
 
 from orchestrator.cli.command_options import (
     CpusOption,
+    FollowOption,
     JsonOption,
     ModelArgument,
     OverwriteOption,
@@ -46,6 +47,7 @@ def register(app: typer.Typer) -> None:
     group = make_group(
         "Manage the racer's leagues: create, submit, table, verify and more. Leagues are append-only.",
         _EXAMPLES,
+        _LEAGUES.lister("List the leagues with their rules."),
     )
     group.command(
         "create", epilog="Example:  muster league create cup --track oval --ranking best --closes 2026-12-24T18:00"
@@ -65,11 +67,18 @@ def create(
     name: Annotated[str, typer.Argument(help="Name of the league.")],
     track: Annotated[
         list[str],
-        typer.Option(help="A preset, random:SEED, or a track of the store. Repeatable: laps use the tracks in turn."),
+        typer.Option(
+            metavar="TRACK",
+            help="A preset, random:SEED, or a track of the store. Repeatable: laps use the tracks in turn.",
+        ),
     ],
     laps: Annotated[int, typer.Option(min=1, max=100, help="Number of laps in a race, each from the start line.")] = 3,
     ranking: Annotated[
-        str, typer.Option(help="The ranking time: total (of all laps), best (lap), average (of the complete laps).")
+        str,
+        typer.Option(
+            metavar="total|best|average",
+            help="The ranking time: of all laps (total), of the best lap, or the average of the complete laps.",
+        ),
     ] = "total",
     continuous: Annotated[
         bool,
@@ -86,16 +95,20 @@ def create(
         typer.Option(min=0, max=10_000, help="Number of times that a car is put back in a lap; the next time ends it."),
     ] = 100,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600, help="Longest simulated time of a lap.")] = 1200.0,
-    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Of every race.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, max=2**31 - 1, help="Seed of every race.")] = 1,
     opens: Annotated[
         str | None,
         typer.Option(
-            help="Opening time, such as 2026-12-01T18:00 (with Z: in UTC); now by default.", show_default=False
+            metavar="TIME",
+            help="Opening time, such as 2026-12-01T18:00 (with Z: in UTC); now by default.",
+            show_default=False,
         ),
     ] = None,
     closes: Annotated[
         str | None,
-        typer.Option(help="Closing time, after which no race can start; never by default.", show_default=False),
+        typer.Option(
+            metavar="TIME", help="Closing time, after which no race can start; never by default.", show_default=False
+        ),
     ] = None,
     most_entries: Annotated[
         int, typer.Option(min=1, max=10_000, help="Greatest number of entries of each key or user.")
@@ -235,28 +248,27 @@ def submit(
         str | None,
         typer.Option("--as", metavar="RACER", help="Name of the racer; by default the name of the key or the user."),
     ] = None,
-    detach: Annotated[
-        bool, typer.Option("--detach", help="Only submit the race; --evaluation enters it after it has ended.")
-    ] = False,
     evaluation: Annotated[
         str | None,
         typer.Option(metavar="JOB", help="Enter this finished race instead of a new one.", show_default=False),
     ] = None,
     store: StoreOption = None,
     cpus: CpusOption = None,
+    follow: FollowOption = True,
     as_json: JsonOption = False,
 ) -> None:
     """Race a model under the rules of a league, follow the race to its end, and enter it permanently.
 
-    The race is an evaluation job, with a temporary controller if none is running. An altered model, a league that is not open and too
+    The race is an evaluation job, with a temporary controller if none is running. With --no-follow, enter it with --evaluation after
+    it has ended. An altered model, a league that is not open and too
     many entries are refused before it starts.
     """
     name, version = split_model(model)
-    if detach and evaluation:
-        raise UsageError("--detach starts a race and --evaluation enters one that has ended; leave one of them out")
+    if not follow and evaluation:
+        raise UsageError("--no-follow starts a race and --evaluation enters one that has ended; leave one of them out")
     body = {"model": name, "version": version, "racer": racer, "directory": os.getcwd()}
     path = f"/api/leagues/{named(league)}"
-    if detach:
+    if not follow:
         with Client.connect() as client:
             _print_started(client.post(f"{path}/races", body, seconds=300, once=True), league, racer, as_json)
         return

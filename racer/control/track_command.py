@@ -24,7 +24,7 @@ OutOption = Annotated[
     Path | None,
     typer.Option("--output", "-o", help="Write the track as a picture (.png) or as data (.npy).", show_default=False),
 ]
-NewName = Annotated[str, typer.Option("--name", help="Name of the track.")]
+NewName = Annotated[str, typer.Option("--name", metavar="NAME", help="Name of the track.")]
 
 _EXAMPLES = """Examples:  muster tracks show random:7 -o track.png
 muster tracks make hills --seed 7 --length 45   then   muster tracks list"""
@@ -34,6 +34,7 @@ def register(app: typer.Typer) -> None:
     group = make_group(
         "Manage the racer's tracks: list, show, make, import. Tracks are immutable.",
         _EXAMPLES,
+        list_tracks,
     )
     group.command("list", epilog="Example:  muster tracks list --json")(list_tracks)
     group.command("show", epilog="Example:  muster tracks show chicane -o chicane.png")(show)
@@ -63,7 +64,7 @@ def show(
 def make(
     name: Annotated[str, typer.Argument(help="Name of the track.")],
     preset: Annotated[
-        str | None, typer.Option(help="Exact straights and arcs: oval, rounded-rectangle, chicane.")
+        str | None, typer.Option(metavar="NAME", help="Exact straights and arcs: oval, rounded-rectangle, chicane.")
     ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of a random closed curve.")] = None,
     length: Annotated[
@@ -79,7 +80,8 @@ def make(
         typer.Option(help="Least radius of a random curve, in metres; 0.75 by default.", show_default=False),
     ] = None,
     direction: Annotated[
-        str | None, typer.Option(help="counter-clockwise (the default) or clockwise.", show_default=False)
+        str | None,
+        typer.Option(metavar="clockwise|counter-clockwise", help="counter-clockwise by default.", show_default=False),
     ] = None,
     output: OutOption = None,
     overwrite: OverwriteOption = False,

@@ -20,7 +20,7 @@ from shared_store.volume.texts import IN_DEFINITION, size_in_definition
 
 
 def main() -> int:
-    """Check the files; returns 0 where all are valid, else 1."""
+    """Check the files; returns 0 where all are valid, 2 where one does not exist, else 1."""
     parser = argparse.ArgumentParser(
         prog="python -m racer.rewards",
         description="Check reward functions of the racer: valid or why not, compiled to the device or why in Python workers.",
@@ -48,6 +48,9 @@ def main() -> int:
                 f'--config: expected a JSON object such as {{"track": "chicane"}}, found {shown(arguments.config)}'
             )
         courses, unknown = courses_for(config, Store(arguments.store) if arguments.store else None)
+    if missing := next((path for path in arguments.files if not path.exists()), None):
+        print(f"{missing}: there is no such file; name a reward function's file", file=sys.stderr)
+        return 2
     for path in arguments.files:
         for line in unknown:
             print(f"{path}: {line}", file=sys.stderr)

@@ -261,7 +261,7 @@ def _function(tree: ast.Module, code: CodeType) -> Iterator[tuple[str, str, int]
     if "reward_function" not in _bound(code):
         near = "the file defines none"
         if other := [node.name for node in tree.body if isinstance(node, ast.FunctionDef)]:
-            near = nearest("reward_function", other, "define it at the top level of the file")
+            near = nearest("reward_function", other, "define it at the top level of the file", cutoff=0.5)
         yield "TEST_FAILURE", f"there is no def reward_function(params); {near}", 0
 
 

@@ -79,7 +79,7 @@ def counted(count: int, noun: str, plural: str = "") -> str:
     return f"{count} {noun if count == 1 else plural or f'{noun}s'}"
 
 
-def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: float = 0.5) -> str:
+def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: float = 0.6) -> str:
     """A hint about a name that is not in ``known``: the nearest of these, else ``otherwise``, or all of them."""
     names = list(known)
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=cutoff)

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -116,18 +117,25 @@ def read_contract(bundle: Path) -> Contract:
         raise DamagedBundle(f"bundle {bundle}: {error}") from None
 
 
-def copy(bundle: Path, target: Path) -> None:
-    """Copy a bundle atomically to ``target``, which must not exist, and verify it.
+def copy(bundle: Path, target: Path, overwrite: bool = False) -> None:
+    """Copy a bundle atomically to ``target``, and verify it.
+
+    Args:
+        bundle: The bundle.
+        target: A directory, which must not exist unless ``overwrite``.
+        overwrite: Replace ``target`` once the copy is complete.
 
     Raises:
         DamagedBundle: The bundle was altered since it was sealed.
         FileExistsError: ``target`` exists.
         OSError: The volume is full or gone.
     """
-    if os.path.lexists(target):
+    if os.path.lexists(target) and not overwrite:
         raise FileExistsError(errno.EEXIST, "exists already", str(target))
     with hidden_folder(target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.tmp") as hidden:
         copy_files(bundle, hidden)
+        if overwrite:
+            shutil.rmtree(target, ignore_errors=True)
         publish(hidden, target)
 
 

@@ -115,7 +115,7 @@ def _path(file: str) -> Path:
     path = Path(file).expanduser()
     if not path.parent.is_dir():
         raise ValueError(f"{file}: there is no folder {path.parent}; relative paths begin at {Path.cwd()}")
-    return _in_folder(file, path.parent, path.name, str(path.parent))
+    return _in_folder(file, path.parent, path.name, str(path.parent.absolute()))
 
 
 def _in_folder(file: str, folder: Path, name: str, where: str) -> Path:
@@ -124,7 +124,7 @@ def _in_folder(file: str, folder: Path, name: str, where: str) -> Path:
         return path
     if path.is_dir():
         raise ValueError(
-            f"{file}: is a folder; name a robot's file in it ({', '.join(_files(path)) or 'there is none'})"
+            f"{file}: is a folder; name a robot's file in it ({', '.join(_files(path)) or 'none is there'})"
         )
     parent = path.parent
     if not parent.is_dir():
@@ -132,7 +132,9 @@ def _in_folder(file: str, folder: Path, name: str, where: str) -> Path:
         raise ValueError(
             f"{file}: there is no folder {parent.name!r} in {where}; {nearest(name, whole, 'look for it')}"
         )
-    raise ValueError(f"{file}: there is no such file in {where}; {nearest(path.name, _files(parent))}")
+    existing = _files(parent)
+    hint = nearest(path.name, existing) if existing else f"no robot's file ({', '.join(FORMATS)}) is there"
+    raise ValueError(f"{file}: there is no such file in {where}; {hint}")
 
 
 def _files(folder: Path) -> list[str]:

@@ -50,10 +50,13 @@ def describe(name: str, whole: bool = False) -> dict[str, Any]:
 
 def _robots(task: Task) -> list[str]:
     """A line for each robot as its file loads today, by which changes are seen, and the task's notes."""
-    return [
-        f"{each.name}: {each.mass:g} kg, {counted(each.joints, 'joint')}, {counted(each.actuators, 'actuator')}"
-        for each in robots_of(task)
-    ] + list(task.notes())
+    lines = []
+    for each in robots_of(task):
+        actuators = sum(actuator >= 0 for actuator in task.views[each.name].actuators)
+        lines.append(
+            f"{each.name}: {each.mass:g} kg, {counted(each.joints, 'joint')}, {counted(actuators, 'actuated joint')}"
+        )
+    return lines + list(task.notes())
 
 
 def _whole(plan: KernelPlan) -> dict[str, Any]:

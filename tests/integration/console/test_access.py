@@ -146,7 +146,7 @@ def test_another_web_page_can_use_no_open_server(shared_server: Serving, headers
 
 
 def test_every_page_loads_its_own_files_alone_and_has_the_strict_policy(console: Console, visitor: Visitor) -> None:
-    pages = [visitor.http.get(path) for path in ("/", "/?search=x", "/nowhere", "/?state=x")]
+    pages = [visitor.http.get(path) for path in ("/", "/?search=x", "/nowhere", "/?status=x")]
     pages.append(httpx.get(f"{console.url}/login", trust_env=False))
     for answer in pages:
         policies = answer.headers.get_list("content-security-policy")

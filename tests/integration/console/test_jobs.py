@@ -61,15 +61,15 @@ def test_jobs_are_found_by_state_queue_and_part_of_a_name(visitor: Visitor, many
     assert names(visitor.page("/?search=JOB-11")) == [f"job-{i}" for i in (*range(119, 109, -1), 11)]
     assert names(visitor.page(f"/?search={many[7][:8]}")) == ["job-7"]
     assert names(visitor.page("/?queue=lab")) == ["job-60"]
-    assert names(visitor.page("/?state=succeeded")) == []
-    assert "No job matches" in visitor.page("/?state=failed").text
-    assert len(names(visitor.page("/?state=waiting&search=job-1"))) == 31
-    assert "it is one of waiting" in visitor.page("/?state=x", 400).text
+    assert names(visitor.page("/?status=succeeded")) == []
+    assert "No job matches" in visitor.page("/?status=failed").text
+    assert len(names(visitor.page("/?status=waiting&search=job-1"))) == 31
+    assert "it is one of waiting" in visitor.page("/?status=x", 400).text
 
 
 @pytest.mark.parametrize("path", ["/", "/jobs/stream"])
 @pytest.mark.parametrize(
-    "query", ["state=failed&state=waiting", "queue=lab&after=1-a&queue=default", "after=1-a&after=1-a"]
+    "query", ["status=failed&status=waiting", "queue=lab&after=1-a&queue=default", "after=1-a&after=1-a"]
 )
 def test_a_filter_that_an_address_gives_twice_is_refused_by_name(console: Console, path: str, query: str) -> None:
     answer = console.visitor().http.get(f"{path}?{query}", headers={"Accept": "application/json"})
@@ -99,7 +99,7 @@ def test_names_of_others_are_text_and_nothing_else(console: Console, definition:
         console.client.batch("TerminateJob", jobId=job, reason=text)
         await_status(console.client, job, "FAILED")
         visitor = console.visitor("lab")
-        for path in ("/?search=hostile", f"/?search={text}", f"/?queue={text}", f"/?state={text}"):
+        for path in ("/?search=hostile", f"/?search={text}", f"/?queue={text}", f"/?status={text}"):
             answer = visitor.http.get(path)
             assert Page(answer.text).is_inert and "<script>alert" not in answer.text, path
         assert text in Page(visitor.http.get("/", params={"search": text}).text).all("input", name="search")[0].values()
@@ -159,7 +159,7 @@ def test_all_that_the_filter_finds_is_stopped_also_beyond_the_page(console: Cons
     lab = console.visitor("lab")
     assert "limited to job queue lab" in lab.refusal("/jobs/stop", job=[many[5]], confirmed="yes")
     assert visitor.submit("/jobs/stop", all="yes", search="job-", confirmed="yes").status_code == 200
-    done = wait_for(lambda: not names(visitor.page("/?state=waiting&search=job-")), 60, "the end of all")
+    done = wait_for(lambda: not names(visitor.page("/?status=waiting&search=job-")), 60, "the end of all")
     assert done and console.client.get("/api/jobs", status="FAILED", search="job-")["total"] == 120
 
 

@@ -362,9 +362,9 @@ def test_down_asks_first_removes_the_stack_and_says_that_the_volume_stays(tmp_pa
         output = "muster: stack muster is in ROLLBACK_COMPLETE and can't be updated; "
         assert again.returncode == 1
         assert again.stderr == f"{output}remove it with `muster aws down`, then try again\n"
-        gone = account.muster("down", "--yes")
+        gone = account.muster("down", "--yes", "--json")
         assert gone.returncode == 0, gone.stderr
-        assert f"file system {volume}, with all runs and checkpoints, stays" in gone.stdout
+        assert json.loads(gone.stdout) == {"stack": "muster", "region": REGION, "fileSystem": volume}
         assert not (tmp_path / "aws.json").exists()
         networks = [each["CidrBlock"] for each in account.client("ec2").describe_vpcs()["Vpcs"]]
         assert "10.20.0.0/16" not in networks and account.client("efs").describe_file_systems()["FileSystems"]

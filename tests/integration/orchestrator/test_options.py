@@ -52,7 +52,9 @@ def test_a_run_is_named_placed_sized_planned_detached_and_printed_as_json(lab: S
 
 def test_a_detached_run_needs_a_controller_and_an_engine_means_its_queue(lab: Serving, tmp_path: Path) -> None:
     spec = str(lab.home / "job.yaml")
-    refused(["run", spec, "--detach"], tmp_path / "empty", 2, "--no-follow: no controller is running", "muster serve")
+    refused(
+        ["run", spec, "--no-follow"], tmp_path / "empty", 2, "--no-follow: no controller is running", "muster serve"
+    )
     refused(["submit", spec, "--queue", "urgent", "--engine", "local"], lab.home, 2, "leave one of them out")
     refused(["submit", spec, "--nodes", "2", "--set", "nodes=3"], lab.home, 2, "--set nodes=3: --nodes sets nodes")
 
@@ -73,7 +75,7 @@ def test_what_does_not_exist_is_refused_with_what_does_and_in_words_of_the_optio
         refused(arguments, lab.home, 2, words)
 
 
-def test_jobs_are_listed_by_state_name_run_age_and_owner_and_stopped_together(lab: Serving) -> None:
+def test_jobs_are_listed_by_status_name_run_age_and_owner_and_stopped_together(lab: Serving) -> None:
     jobs = [lab.gang(FOREVER, name=name) for name in ("wolf-1", "wolf-2", "sheep")]
     for job in jobs:
         lab.wait(job, "RUNNING")
@@ -81,7 +83,7 @@ def test_jobs_are_listed_by_state_name_run_age_and_owner_and_stopped_together(la
     def names(*filters: str) -> set[str]:
         return {each["jobName"] for each in printed(lab, "list", *filters)}
 
-    assert names("--state", "running", "--name", "wolf-*") == {"wolf-1", "wolf-2"} == names("--name", "wolf-[12]")
+    assert names("--status", "running", "--name", "wolf-*") == {"wolf-1", "wolf-2"} == names("--name", "wolf-[12]")
     assert (
         names("--run", lab.detail(jobs[2])["run"]) == {"sheep"} == names("--name", "sheep", "--mine", "--since", "1h")
     )
@@ -101,13 +103,13 @@ def test_jobs_are_listed_by_state_name_run_age_and_owner_and_stopped_together(la
 def test_runs_are_listed_with_their_last_job_and_a_resume_is_planned(lab: Serving) -> None:
     ended = printed(lab, "run", str(lab.home / "job.yaml"), "--name", "again")
     run = ended["run"]
-    header, row = lab.muster("runs", "--search", "again").stdout.splitlines()
+    header, row = lab.muster("runs", "--name", "again-*").stdout.splitlines()
     assert header.split()[:3] == ["RUN", "TASK", "ITERATION"] and row.split()[0] == run
     assert ended["jobId"][:8] in row and "SUCCEEDED" in row
-    assert printed(lab, "runs", "list", "--search", "again")[0]["jobs"][-1]["id"] == ended["jobId"]
+    assert printed(lab, "runs", "list", "--name", "again-*")[0]["jobs"][-1]["id"] == ended["jobId"]
     planned = printed(lab, "resume", run, "--nodes", "2", "--dry-run")
     assert len(planned["nodes"]) == 2 and planned["registerJobDefinition"]["jobDefinitionName"] == "again"
-    assert len(printed(lab, "runs", "--search", "again")[0]["jobs"]) == 1
+    assert len(printed(lab, "runs", "--name", "again-*")[0]["jobs"]) == 1
     refused(["resume", f"{run}@7"], lab.home, 2, f"run {run} has no checkpoint yet")
 
 

@@ -70,7 +70,7 @@ def test_a_race_is_a_job_of_its_own_kind_with_the_rules_that_were_given(full: Se
 def test_copying_step_logs_replaces_no_file(full: Serving, tmp_path: Path) -> None:
     (tmp_path / "sim-trace").mkdir()
     output = refusal(full, "evaluate", "fast-car", "--race", "-o", str(tmp_path))
-    assert "sim-trace exists; name another directory" in output
+    assert "sim-trace exists; --overwrite replaces it" in output
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ REFUSED = {
     "submit cup fast@1 --as \x1b[31m": "use letters, digits, spaces",
     "submit cup fast@1 --evaluation nothing": "job nothing does not exist",
     "submit cup fast@1 --evaluation blocker": "is RUNNING: only a race that has SUCCEEDED is entered",
-    "submit cup fast@1 --evaluation x --detach": "leave one of them out",
+    "submit cup fast@1 --evaluation x --no-follow": "leave one of them out",
     "submit past fast@1": "league past closed at 2020-01-01 00:00:00 UTC",
     "submit future fast@1": "league future opens at 2999-01-01 00:00:00 UTC",
     "disqualify cup 9 --reason x": "league cup: entry 9 does not exist",
@@ -160,7 +160,7 @@ def test_wrong_use_is_one_line_and_starts_nothing(cups: Paddock, line: str) -> N
 
 def test_a_race_is_a_job_of_the_league_s_rules(cups: Paddock) -> None:
     cups.done("create", "long", "--track", "oval", "--laps", "5", "--continuous", "--seed", "11", "--seconds", "60")
-    message = cups.done("submit", "long", "fast@2", "--as", "ada", "--detach")
+    message = cups.done("submit", "long", "fast@2", "--as", "ada", "--no-follow")
     job = json.loads(cups.server.muster("list", "--json").stdout)[0]["jobId"]
     assert message.splitlines() == [
         f"submitted the race of fast@2 as {job}",

@@ -51,7 +51,8 @@ def test_all_tasks_are_listed_with_what_they_see_do_and_are_rewarded_for(tmp_pat
 def test_one_task_is_described_by_name_and_a_wrong_name_is_refused_in_one_line(tmp_path: Path) -> None:
     own = run_muster("tasks", OWN, home=tmp_path).stdout
     assert "cosine, sine, velocity" in own and "upright 1" in own and "hinge" in own
-    assert re.search(r"^ROBOTS\nrobot: \S+ kg, 1 joint, 1 actuator$", own, re.M), own
+    assert re.search(r"^ROBOTS\nrobot: \S+ kg, 1 joint, 1 actuated joint$", own, re.M), own
+    assert max(map(len, own.splitlines())) <= 120 and own.count("\nOBSERVATIONS\n") == own.count("\nACTIONS\n") == 1
     wrong = run_muster("tasks", "Quadrupet", home=tmp_path)  # which imports nothing
     assert wrong.returncode == 2 and len(wrong.stderr.splitlines()) == 1
     assert "no task is called 'Quadrupet'; did you mean Quadruped?" in wrong.stderr

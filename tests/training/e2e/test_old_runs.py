@@ -119,7 +119,7 @@ def test_a_run_resumed_from_its_middle_ends_with_the_same_bits(
 
 def resumed_epoch(served: KeyServing, run: Run, iteration: int) -> int:
     """Resume the run from a checkpoint, to its end; returns the epoch of that."""
-    job = served.answer("resume", run.name, "--checkpoint", str(iteration))["jobId"]
+    job = served.answer("resume", f"{run.name}@{iteration}")["jobId"]
     epoch: int = succeeded(served, job)["attempts"][-1]["epoch"]
     return epoch
 

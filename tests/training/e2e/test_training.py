@@ -56,7 +56,7 @@ def test_a_stopped_run_goes_on_at_the_next_iteration(server: Serving) -> None:
     steps = records[0]["env_steps"]
     assert [record["env_steps"] for record in records] == [steps * i for i in range(1, target + 1)]
 
-    missing = server.muster("resume", job["run"], "--checkpoint", "3")
+    missing = server.muster("resume", f"{job['run']}@3")
     assert missing.returncode == 2 and "has no checkpoint of iteration 3" in missing.stderr
     _check_damage(server, job["run"], target)
 
@@ -69,9 +69,7 @@ def _check_damage(server: Serving, run: str, target: int) -> None:
     verified = server.muster("checkpoints", run, "--verify")
     assert verified.returncode == 1 and "learner.pt has" in verified.stdout
     jobs = len(server.client.get(f"/api/runs/{run}")["jobs"])
-    chosen = server.muster(
-        "resume", run, "--checkpoint", str(newest["iteration"]), "--set", f"train.iterations={target + 3}"
-    )
+    chosen = server.muster("resume", f"{run}@{newest['iteration']}", "--set", f"train.iterations={target + 3}")
     assert chosen.returncode == 1 and "learner.pt has" in chosen.stderr and "Traceback" not in chosen.stderr
     assert len(server.client.get(f"/api/runs/{run}")["jobs"]) == jobs, "nothing was submitted"
     resumed = server.muster("resume", run, "--json", "--set", f"train.iterations={target + 3}")

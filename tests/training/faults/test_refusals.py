@@ -67,11 +67,11 @@ def served(trained_home: Path, tmp_path_factory: pytest.TempPathFactory) -> Iter
         yield server, run_in(server.home).name
 
 
-def refused(served: tuple[Serving, str], code: int, *arguments: str) -> str:
+def refused(served: tuple[Serving, str], code: int, *arguments: str, at: str = "") -> str:
     """The one line with which ``muster resume`` refuses; nothing was submitted, so no process starts."""
     server, run = served
     jobs = len(server.client.get(f"/api/runs/{run}")["jobs"])
-    done = server.muster("resume", run, "--set", "train.iterations=4", *arguments)
+    done = server.muster("resume", run + at, "--set", "train.iterations=4", *arguments)
     assert done.returncode == code and len(done.stderr.splitlines()) == 1, done.stderr
     assert len(server.client.get(f"/api/runs/{run}")["jobs"]) == jobs
     return done.stderr
@@ -109,8 +109,8 @@ def test_a_checkpoint_of_a_newer_format(served: tuple[Serving, str]) -> None:
     newest = list_checkpoints(Store(server.home / "store").run(run))[-1]
     edit_manifest(newest, format=FORMAT + 1)
     try:
-        for arguments in ([], ["--checkpoint", "2"]):
-            message = refused(served, 1, *arguments)
+        for at in ("", "@2"):
+            message = refused(served, 1, at=at)
             assert (
                 f"{newest.name}: has format {FORMAT + 1}, this Muster reads up to {FORMAT}; upgrade Muster" in message
             )

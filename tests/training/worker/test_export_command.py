@@ -63,7 +63,7 @@ def test_a_run_is_exported_registered_compared_and_verified(home: Path, tmp_path
     [
         (("export", "RUN@7"), "run RUN has no checkpoint of iteration 7; available: 1, 2"),
         (("export", "RUNX"), "did you mean RUN?"),
-        (("export", "RUN", "-o", "/"), "-o /: exists already; name a new directory"),
+        (("export", "RUN", "-o", "/"), "-o /: it exists and is not a bundle; name a new directory"),
         (("models", "register", "RUN@7", "--name", "x"), "run RUN has no checkpoint of iteration 7; available: 1, 2"),
         (("models", "register", "RUN", "--name", "../x"), "model name '../x': use letters, digits"),
         (("models", "show", "nothing"), "model nothing does not exist"),

@@ -298,6 +298,8 @@ def test_the_command_reports_errors_or_the_mode_of_execution(
     slower = "hundreds of times slower than compiled ones for thousands of cars"
     assert note == f"{slow}: line 3: a list that grows: such functions run in Python workers, {slower}"
     assert errors.strip().endswith(NONE)
+    monkeypatch.setattr(sys, "argv", ["rewards", str(tmp_path / "missing.py")])
+    assert main() == 2 and "missing.py: there is no such file" in capsys.readouterr().err
 
 
 def test_the_samples_are_what_a_car_on_the_oval_sees() -> None:

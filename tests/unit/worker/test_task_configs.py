@@ -218,6 +218,22 @@ def test_a_function_that_warp_cannot_compile_is_named_first(folder: Path) -> Non
         kind(kind.config_type(), 2, seed=0, device="cpu")
     sys.modules.pop("warped", None)
     assert str(mistake.value).startswith("task warped:Bad: warped.py:6: `joint_qq` is not an attribute of 'worlds'")
+    outer = "Invalid external reference type: <class 'warp._src.codegen.Struct.__init__.<locals>.NewStructInstance'>"
+    words = "6: a Warp function can't use a Warp struct from outside; make it a parameter"
+    with pytest.raises(TaskMistake, match=words), task_mistakes("warped:Bad"):
+        raise TypeError(f'Error while parsing function "f" at {folder}/warped.py:6:\n    return M.a\n;{outer}')
+
+
+def test_an_unknown_class_is_refused_with_the_tasks_of_its_module(folder: Path) -> None:
+    (folder / "own.py").write_text(
+        "from worker.tasks.library.cartpole import Cartpole\nMine = Cartpole.with_(config={'substeps': 2})\n"
+        "Draft = Mine.with_(config={'substeps': 3})\n"
+    )
+    with pytest.raises(
+        ValueError, match=r"own has no class 'Nope' that is a worker\.tasks\.Task; there are Mine, Draft$"
+    ):
+        find_task("own:Nope")
+    sys.modules.pop("own", None)
 
 
 def test_transient_errors_and_musters_own_defects_are_not_mistakes_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,10 +80,11 @@ def find_task(name: str) -> type[Task]:
     from worker.tasks.run.task import Task
 
     if not (isinstance(found, type) and issubclass(found, Task)):
-        classes = [each for each in vars(module).values() if isinstance(each, type) and each.__module__ == module_name]
-        hint = nearest(class_name, [each.__name__ for each in classes if issubclass(each, Task)])
+        classes = {key: each for key, each in vars(module).items() if isinstance(each, type) and issubclass(each, Task)}
+        own = [key for key, each in classes.items() if each.__module__ == module_name]  # with_ names no class
+        hint = nearest(class_name, own)
         raise ValueError(
-            f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.run.task.Task; {hint}"
+            f"task {name!r}: {module_name} has no class {class_name!r} that is a worker.tasks.Task; {hint}"
         )
     if found.changes and module_name == found.__module__:  # by with_, which knows no name
         found.__name__ = found.__qualname__ = class_name

@@ -19,6 +19,12 @@ _OURS = str(Path(__file__).parents[2])
 _INSTALLED = tuple({sysconfig.get_path(kind) for kind in ("purelib", "platlib", "stdlib", "platstdlib")})
 _PARSED = re.compile(r'Error while parsing function "[^"]*" at (?P<file>[^\n]+):(?P<line>\d+):\n')
 """Warp's message about a function that can't be compiled, once for each function in the call chain."""
+_OUTER = re.compile(r"Invalid external reference type: <class '[^']*?(\w+)'>")
+"""Warp's message about a variable outside the function."""
+_INSIDE = re.compile(r" \(<[^>]*\bwarp\._src\.[^>]*>\)")
+"""An object of Warp's in its message."""
+_STRUCT = "NewStructInstance"
+"""Warp's class of all structs."""
 _MISSING_FILES = (FileNotFoundError, IsADirectoryError, NotADirectoryError, PermissionError)
 
 
@@ -59,6 +65,8 @@ def _mistake(error: Exception, task: str) -> TaskMistake | None:
     if is_out_of_memory(error) or (isinstance(error, OSError) and not isinstance(error, _MISSING_FILES)):
         return None
     text = error.args[0] if error.args and isinstance(error.args[0], str) else str(error)
+    if struct := getattr(getattr(error, "obj", None), "cls", None):
+        text = text.replace(_STRUCT, struct.__name__)
     if (parsed := _parsed(text, package)) is not None:
         where, words = parsed
         return TaskMistake(f"task {task}: {where}: {words}")
@@ -98,7 +106,10 @@ def _parsed(text: str, package: str) -> tuple[str, str] | None:
     if not users:
         return None
     source, _, message = text[users[-1].end() :].partition("\n;")
-    message = " ".join((message or source).removeprefix("Error, ").split())
+    message = _INSIDE.sub("", " ".join((message or source).removeprefix("Error, ").split()))
+    if outer := _OUTER.search(message):
+        kind = "Warp struct" if outer[1] == _STRUCT else outer[1]
+        message = f"a Warp function can't use a {kind} from outside; make it a parameter, or use a number"
     return (
         f"{_shown(users[-1]['file'])}:{users[-1]['line']}",
         f"{message} (in `{source.strip()}`)" if source else message,
@@ -114,7 +125,7 @@ def _hint(error: Exception, frame: FrameType) -> str:
         known = [*_names(frame.f_code), *frame.f_globals, *dir(builtins)]
     elif isinstance(error, ImportError) and (found := re.match(r"cannot import name '(\w+)'", str(error))):
         known, name = dir(sys.modules.get(str(error.name))), found[1]
-    near = nearest(name, known, " ", cutoff=0.6) if name and known else ""
+    near = nearest(name, known, " ") if name and known else ""
     return near.strip()
 
 

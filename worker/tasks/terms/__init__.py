@@ -79,7 +79,9 @@ def __getattr__(name: str) -> Any:
         return import_module(f"{__name__}.{name}")
     further = vars(import_module(f"{__name__}.more"))
     if name not in further:
-        raise AttributeError(f"there is no term {name!r}; {nearest(name, __dir__())}")
+        raise AttributeError(
+            f"there is no term {name!r}; {nearest(name, __dir__(), 'docs/tasks/terms.md lists them')}", name=None
+        )
     return further[name]
 
 

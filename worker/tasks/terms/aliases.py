@@ -84,5 +84,7 @@ def term_named(library: str, name: str) -> wp.Function:
         names, owner, instead = (each.strip() for each in row.strip("|").split(" | "))
         if owner == LIBRARIES[library] and name in re.findall(r"`(\w+)`", names):
             plain = re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", instead)
-            raise AttributeError(f"{owner}'s {name} is not a term here (docs/tasks/porting.md): {plain}")
-    raise AttributeError(f"no term has the name {name!r} in {LIBRARIES[library]}; {nearest(name, list(known))}")
+            raise AttributeError(f"{owner}'s {name} is not a term here (docs/tasks/porting.md): {plain}", name=None)
+    hint = nearest(name, list(known), "docs/tasks/porting.md lists them")
+    words = f"no term has the name {name!r} in {LIBRARIES[library]}; {hint}"
+    raise AttributeError(words, name=None)  # without a name Python adds no second hint

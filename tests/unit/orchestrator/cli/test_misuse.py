@@ -13,7 +13,7 @@ import pytest
 
 from orchestrator.cli.catalogue import ENTRIES, load
 from orchestrator.cli.misuse import CommandGroup
-from tests.conftest import MUSTER, call_muster
+from tests.conftest import MUSTER, REPOSITORY, call_muster
 
 PLUGIN = " (if a plug-in provides it, install the plug-in's package)"
 MISUSE = {
@@ -36,10 +36,9 @@ MISUSE = {
     ),
     "serve --port": "--port needs a value; see: muster serve --help",
     "list --json=5": "--json takes no value; see: muster list --help",
-    "list --state fail": "--state FAIL: unknown state; did you mean FAILED?",
-    "resume ant@3 --checkpoint 4": "--checkpoint 4: ant@3 names a checkpoint, too; leave one of them out",
+    "list --status fail": "--status FAIL: unknown status; did you mean FAILED?",
     "--server http://x keys list": "--server: muster keys works on this machine, without a controller; leave --server out",
-    "runs --search ant list": "--search: an option of muster runs alone; leave list out",
+    "runs --name ant list": "--name: an option of muster runs alone; leave list out",
     "list --server=": "--server: expected the URL of a controller, such as http://127.0.0.1:8080",
     "keys list --server http://x": "--server: unknown option; see: muster keys list --help",
 }
@@ -56,10 +55,28 @@ def test_user_input_reaches_the_terminal_as_text(tmp_path: Path) -> None:
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1 and "\x1b" not in done.stderr
 
 
-@pytest.mark.parametrize("typed", ["", "models", "webhooks"])
+@pytest.mark.parametrize("typed", ["--help", "schema", "run --help"])
+def test_a_closed_pipe_ends_a_command_with_0_and_without_a_message(typed: str) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([MUSTER, *typed.split()], stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("typed", ["", "aws"])
 def test_a_group_without_a_command_shows_its_help_alone(tmp_path: Path, typed: str) -> None:
     done = call_muster(*typed.split(), home=tmp_path)
     assert done.returncode == 2 and "Usage: muster" in done.stdout and done.stderr == ""
+
+
+def test_a_group_without_a_command_lists(tmp_path: Path) -> None:
+    assert [
+        name for name, group in commands() if "list" in getattr(group, "commands", {}) and group.no_args_is_help
+    ] == []
+    assert call_muster("keys", home=tmp_path).stdout == call_muster("keys", "list", home=tmp_path).stdout != ""
+    made = call_muster("keys", "create", "ada", home=tmp_path, MUSTER_DATABASE=str(tmp_path / "other.db"))
+    assert made.returncode == 0, made.stderr
 
 
 def commands() -> list[tuple[str, Any]]:
@@ -70,7 +87,7 @@ def commands() -> list[tuple[str, Any]]:
     ]
 
 
-SHARED = ("--json", "--dry-run", "--set", "--server", "--cpus", "--nodes", "--queue")
+SHARED = ("--json", "--dry-run", "--set", "--server", "--cpus", "--nodes", "--queue", "--overwrite", "--yes", "--store")
 
 
 def test_every_group_refuses_unknown_commands_alike_and_every_command_has_an_example_and_a_summary() -> None:
@@ -91,13 +108,21 @@ def test_an_option_has_one_spelling_and_one_form_in_all_commands_and_help_is_a_w
                 forms.setdefault(param.opts[0], set()).add((*param.opts, *param.secondary_opts, param.metavar))
             assert param.hidden or param.help[0].isupper() or param.help.startswith("postgresql"), (name, param.opts)
     assert {option: len(found) for option, found in forms.items()} == dict.fromkeys(SHARED, 1)
+    lacking = {name for name, command in own if "--json" not in str([each.opts for each in command.params])}
+    (listed,) = re.findall("All commands take `--json` but (.*), which", (REPOSITORY / "docs/jobs.md").read_text())
+    assert lacking == {*re.findall("`(.*?)`", listed)} | {"aws"}, "the group has no options"
     first = {name: command.params[0].metavar for name, command in own if command.params}
     assert {first[name] for name in ("resume", "clone", "evaluate", "export")} == {"RUN[@ITERATION|@best|@latest]"}
 
 
 def test_help_shows_flags_without_a_value_and_where_the_controller_is_named(tmp_path: Path) -> None:
     shown = call_muster("resume", "--help", home=tmp_path).stdout
-    assert "-f, --follow  " in shown and "--set KEY=VALUE " in shown and "--server URL " in shown and "<" not in shown
+    assert (
+        "-f, --follow / --no-follow  " in shown
+        and "--set KEY=VALUE " in shown
+        and "--server URL " in shown
+        and "<" not in shown
+    )
     root = call_muster("--help", home=tmp_path).stdout
     assert all(part in root for part in ("--server URL", "$MUSTER_URL", "$MUSTER_TOKEN", "muster --install-completion"))
 

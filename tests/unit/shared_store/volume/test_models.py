@@ -87,6 +87,9 @@ def test_a_copy_is_atomic(bundle: Path, tmp_path: Path) -> None:
     assert bundles.verify(tmp_path / "out" / "copy") == bundles.verify(bundle)
     with pytest.raises(FileExistsError):
         bundles.copy(bundle, tmp_path / "out" / "copy")
+    (tmp_path / "out" / "copy" / "old").touch()
+    bundles.copy(bundle, tmp_path / "out" / "copy", overwrite=True)
+    assert bundles.verify(tmp_path / "out" / "copy") == bundles.verify(bundle)
     flip(bundle / "policy.onnx", 0)
     with pytest.raises(DamagedBundle):
         bundles.copy(bundle, tmp_path / "out" / "second")
