@@ -1,4 +1,4 @@
-"""The racer's car as a declared task has it: declared beside its sensors, moved by a kinematic model, read by its terms."""
+"""The racer's car as a task has it: declared beside its sensors, moved by a kinematic model, read by its terms."""
 
 from __future__ import annotations
 
