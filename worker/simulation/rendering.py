@@ -49,7 +49,7 @@ def displace(
 def _paint(colors: float, episodes: EpisodeArrays, shape_colors: wp.array2d[wp.vec3f]):
     """The colours of one world's shapes: drawn once, behind the six numbers of its camera's pose.
 
-    Not a ``Randomize``: those change arrays of the solver's model, which has no colours, lights and cameras.
+    Not a ``Randomize``: those change the solver's model, and images show Newton's.
     """
     world = wp.tid()
     stream = numbered_stream(episodes, world, _STREAM)

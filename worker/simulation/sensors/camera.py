@@ -208,10 +208,10 @@ class Camera(Sensor):
         self._update_poses()
 
     def _displace(
-        self, stream: int, position: Any, angle: Any, supplied: wp.array[wp.transform], poses: wp.array[wp.transform]
+        self, stream: int, position: Any, angle: Any, usual_poses: wp.array[wp.transform], poses: wp.array[wp.transform]
     ) -> None:
-        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, supplied]
-        wp.launch(displace, dim=supplied.shape, inputs=inputs, outputs=[poses], device=self._device)
+        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, usual_poses]
+        wp.launch(displace, dim=usual_poses.shape, inputs=inputs, outputs=[poses], device=self._device)
 
     def _update_poses(self) -> None:
         inputs = [self._bodies, self._body, self._mounts, self.arrays]
