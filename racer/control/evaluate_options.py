@@ -63,7 +63,13 @@ def race_or_evaluate(
     ] = None,
 ) -> None:
     """Evaluate a checkpoint, or have it drive a race. Raises what :func:`.follow_evaluation` raises."""
-    race_options = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None, "output": output}
+    race_options = {
+        "trials": trials,
+        "continuous": continuous,
+        "penalty": penalty,
+        "track": track or None,
+        "output": output,
+    }
     _refuse_mixed(race, {"episodes": arguments["episodes"], "worlds": arguments["worlds"]}, race_options)
     if not race:
         evaluate(**arguments)
