@@ -1,4 +1,4 @@
-"""Cost of the parts of a declared task on this device: kernels, sensors, terms, and compilation.
+"""Cost of the parts of a task on this device: kernels, sensors, terms, and compilation.
 
     python -m benchmarks.tasks [--tasks Ant Quadruped] [--worlds 4096] [--no-compile] [--out DIRECTORY]
 

@@ -28,7 +28,7 @@ EXAMPLE_URL = "http://127.0.0.1:8080"
 
 _PAUSES = (0.2, 0.4, 0.8, 1.6, 0)
 """Seconds after each refusal for too many requests or connections; the last refusal is reported."""
-_BARREN = 4
+_MOST_EMPTY = 4
 """Streams in a row that broke off without a line, after which those of a job that is over are given up."""
 _LONGEST_PAUSE = 5.0
 """Seconds between two streams that brought no line."""
@@ -154,7 +154,7 @@ class Client:
     def log_batches(self, job: str, **query: Any) -> Iterator[list[dict[str, Any]]]:
         """:meth:`logs`, as many lines at a time as have come: none where none have come for some seconds."""
         positions: dict[str, int] = {}
-        barren = 0
+        empty = 0
         while True:
             before, broken = dict(positions), None
             try:
@@ -168,11 +168,11 @@ class Client:
                 if not query.get("follow"):
                     raise
                 broken = error
-            barren = barren + 1 if positions == before else 0
-            if barren:
-                time.sleep(min(0.1 * 2**barren, _LONGEST_PAUSE))
+            empty = empty + 1 if positions == before else 0
+            if empty:
+                time.sleep(min(0.1 * 2**empty, _LONGEST_PAUSE))
             self.await_return()
-            if broken and barren >= _BARREN and self._is_over(job):
+            if broken and empty >= _MOST_EMPTY and self._is_over(job):
                 raise broken
 
     def _is_over(self, job: str) -> bool:

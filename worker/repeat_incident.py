@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from worker.tasks.run.task import Task
 
 SHOWN = 10
-"""At most so many steps with mishaps are shown."""
+"""At most so many steps with failed worlds are shown."""
 
 
 def load(path: Path, device: str) -> tuple[Task, dict[str, Any]]:
@@ -90,11 +90,11 @@ def repeat(path: Path, device: str) -> int:
     for step, action in enumerate(actions):
         state = {name: tensor.cpu().clone() for name, tensor in task.state_tensors().items()}
         task.step(action)
-        mishap = task.read_mishap(int(task.mishap))
-        if mishap is None:
+        failed_world = task.read_failed_world(int(task.failed_world))
+        if failed_world is None:
             continue
         found += 1
-        world, cause = mishap
+        world, cause = failed_world
         print(f"step {step + 1}: world {content['first_world'] + world}: {cause}; before it:")
         for name in (name for name in state if name.startswith("joint")):
             print(f"  {name}: {[round(value, 6) for value in state[name].view(task.world_count, -1)[world].tolist()]}")

@@ -36,6 +36,11 @@ NAMES = {
     "heard": "received, last_seen",
     "somebody": "user, owner",
     "looked": "polled, read",
+    "deaf": "unresponsive, cut_off",
+    "deafness": "unresponsive, cut_off",
+    "barren": "empty, skipped",
+    "mishap": "incident, failure",
+    "mishaps": "incidents, failures",
 }
 """Parts of identifiers, and the field's words for what they mean."""
 PHRASES = {
@@ -50,6 +55,8 @@ PHRASES = {
     r"\bwhat there (?:is|are|was|were)\b": "what exists",
     r"\bout of sight\b": "no permission to see",
     r"\bin trouble\b": "unhealthy",
+    r"\b(?:deaf(?:ness)?|barren)\b": "unresponsive, empty",
+    r"\bmishaps?\b": "an incident, a failure",
     r"\bnot heard\b": "unknown, no heartbeat",
     r"\b(?:expected|holds|is|be) a text\b": "a string",
     r"\bby themselves alone\b": "alone",

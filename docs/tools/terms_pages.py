@@ -21,7 +21,7 @@ SHARED = ("WorldArrays", "EpisodeArrays", "BodyArrays", "TerrainArrays")
 REFERENCE = """\
 # Terms
 
-The functions of `worker.tasks.terms`. A declared task names them, such as
+The functions of `worker.tasks.terms`. A task names them, such as
 `Reward(terms.joint_velocity_squared, joints="*_knee")`; [porting.md](porting.md) maps mjlab's and Isaac Lab's terms to
 them. `python -m docs.tools` writes this page from the functions' docstrings.
 
@@ -89,7 +89,8 @@ def porting() -> str:
         rows.sort(key=lambda row: row[0].lower())
         table = ["| their name | ours | differences, owner |", "|---|---|---|", *(row for _, row in rows)]
         parts.append(f"## {title}\n\n" + "\n".join(table) + "\n")
-    return "\n".join([*parts, ELSEWHERE_HEAD + ELSEWHERE])
+    elsewhere = (f"| `{name}` | {LIBRARIES[library]} | {instead} |\n" for name, (library, instead) in ELSEWHERE.items())
+    return "\n".join([*parts, ELSEWHERE_HEAD + "".join(elsewhere)])
 
 
 def _module(group: str) -> ModuleType:

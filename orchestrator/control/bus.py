@@ -73,7 +73,7 @@ attempts; the proofs do that. The controller's own session is inside the router:
 
 _THREADS = "(rx: (worker_threads: 32))"
 """The router's receiving threads, in the syntax of ``ZENOH_RUNTIME``. A node that vanishes silently blocks one of them for 10 s
-(eclipse-zenoh/zenoh#2718): with the default of two, a host that dies with many nodes makes the router deaf for 5 s a node."""
+(eclipse-zenoh/zenoh#2718): with the default of two, a host that dies with many nodes makes the router unresponsive for 5 s a node."""
 
 _UNANSWERED = 5.0
 """Seconds for which a command without an answer is kept."""

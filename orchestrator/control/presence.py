@@ -72,9 +72,9 @@ class Presence:
         self._silent = 0
         """How many of them are silent."""
         self._hears_itself = False
-        self._deaf_since: float | None = None
+        self._cut_off_since: float | None = None
         """Since when the controller may be cut off from its nodes; None while it is not."""
-        self._deaf_at = 0.0
+        self._cut_off_at = 0.0
         """When that was so the last time, as far as is known."""
         self._burst: int | None = None
         """How many nodes fell silent together; None where that is to be counted anew."""
@@ -115,7 +115,7 @@ class Presence:
         with self._lock:
             seen = self._nodes.get(node)
             if seen is not None and seen.gone is None:
-                self._note_deafness()
+                self._note_cut_off()
                 self._sign_at = self._monotonic()
 
     def left(self, node: Node) -> None:
@@ -133,7 +133,7 @@ class Presence:
     def hear_itself(self, arrived: bool) -> None:
         """Whether the router hears the controller's own session, by way of the loopback network."""
         with self._lock:
-            self._note_deafness()
+            self._note_cut_off()
             self._hears_itself = arrived
 
     def met(self, node: Node) -> bool:
@@ -145,8 +145,8 @@ class Presence:
     def cut_off(self) -> str | None:
         """Why the controller takes itself to be cut off from its nodes; None while it does not, or not for long."""
         with self._lock:
-            why = self._note_deafness()
-            since = self._deaf_since
+            why = self._note_cut_off()
+            since = self._cut_off_since
         return why if since is not None and self._monotonic() - since > UNHEARD else None
 
     def silence(self, node: Node, age: float | None, runs: bool = True) -> Silence | None:
@@ -166,14 +166,14 @@ class Presence:
             seen = self._nodes.get(node)
             if seen is None or seen.gone is None:
                 return None
-            deaf = self._note_deafness()
+            cut_off = self._note_cut_off()
             if age is None or age > min(now - seen.gone, max(_FRESH, self.lost_after / 4)):
                 seen.answered = seen.confirmed = now
             if not runs:
                 seen.confirmed = now
-            alone = now - max(seen.confirmed, self._deaf_at)
+            alone = now - max(seen.confirmed, self._cut_off_at)
             is_lost = alone > self.lost_after or (not runs and now - seen.answered > UNREACHABLE * self.lost_after)
-            return Silence(now - seen.gone, seen.since, is_lost, deaf or "")
+            return Silence(now - seen.gone, seen.since, is_lost, cut_off or "")
 
     def _moment(self) -> tuple[float, str]:
         """Now, in seconds of the monotonic clock and for people."""
@@ -184,7 +184,7 @@ class Presence:
 
     def _set(self, node: Node, seen: _Seen | None) -> None:
         """Note what is known of a node; None: nothing."""
-        self._note_deafness()
+        self._note_cut_off()
         self._unmet.pop(node[:2], None)
         self._missing.pop(node, None)
         before = self._nodes.pop(node, None)
@@ -193,16 +193,16 @@ class Presence:
         self._silent += (seen is not None and seen.gone is not None) - (before is not None and before.gone is not None)
         self._burst = None
 
-    def _note_deafness(self) -> str | None:
+    def _note_cut_off(self) -> str | None:
         """Why the controller may be the one that is cut off; None while it is not. Before each change: silence counts from its end on."""
-        if not self._silent or (why := self._why_deaf()) is None:
-            self._deaf_since = None
+        if not self._silent or (why := self._why_cut_off()) is None:
+            self._cut_off_since = None
             return None
-        self._deaf_at = self._monotonic()
-        self._deaf_since = self._deaf_at if self._deaf_since is None else self._deaf_since
+        self._cut_off_at = self._monotonic()
+        self._cut_off_since = self._cut_off_at if self._cut_off_since is None else self._cut_off_since
         return why
 
-    def _why_deaf(self) -> str | None:
+    def _why_cut_off(self) -> str | None:
         nodes = len(self._nodes)
         if nodes >= _FEWEST and 2 * (burst := self._silent_together()) > nodes:
             return f"{burst} of {nodes} nodes fell silent within {_BURST:.0f} s, so the controller seems to be cut off"

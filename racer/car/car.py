@@ -1,4 +1,4 @@
-"""The racer's car as a declared task has it: declared beside its sensors, moved by a kinematic model, read by its terms."""
+"""The racer's car as a task has it: declared beside its sensors, moved by a kinematic model, read by its terms."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 import warp as wp
 
 from racer.car.car_arrays import CarArrays, ResetRules, begin_car, follow_car, move_car
-from racer.car.resets import COUNTS, forget_mishaps, go_on, note_mishap
+from racer.car.resets import COUNTS, forget_incidents, go_on, note_incident
 from racer.car.trace import COLUMNS, trace_car
 from racer.tracks.circuit import BOX, Circuit
 from racer.tracks.road import road_arrays
@@ -48,7 +48,7 @@ COUNTED = (
     "falling",
     "next_obstacle",
     "last_obstacle",
-    "mishaps",
+    "incidents",
 )
 MEASURED = ("speeds", "steerings", "distances", "along", "headings", "widths", "travelled", "moved", "set_back")
 
@@ -70,7 +70,7 @@ def _move(
 def _follow(car: CarArrays):
     world = wp.tid()
     follow_car(world, car)
-    note_mishap(world, car)
+    note_incident(world, car)
 
 
 @wp.kernel
@@ -83,7 +83,7 @@ def _begin(episodes: EpisodeArrays, car: CarArrays):
     world = wp.tid()
     if episodes.ages[world] == 0:
         begin_car(world, car)
-        forget_mishaps(world, car)
+        forget_incidents(world, car)
     elif car.put[world]:
         go_on(world, car)
 

@@ -83,7 +83,7 @@ class CarArrays:
         next_obstacle: Index of the first obstacle ahead; -1: there is none, shape ``(worlds,)``.
         last_obstacle: Index of the first one behind; -1: there is none, shape ``(worlds,)``.
         rules: When cars are put back.
-        mishaps: What went wrong in the last control step, see :data:`racer.car.resets.MISHAPS`; 0: nothing, shape ``(worlds,)``.
+        incidents: What went wrong in the last control step, see :data:`racer.car.resets.INCIDENTS`; 0: nothing, shape ``(worlds,)``.
         put: Whether the car is put back for it, shape ``(worlds,)``.
         put_poses: Where to, where ``put``: as ``poses``, shape ``(worlds,)``.
         set_back: How much of its way along the centre line it loses by that [m], shape ``(worlds,)``.
@@ -123,7 +123,7 @@ class CarArrays:
     next_obstacle: wp.array[wp.int32]
     last_obstacle: wp.array[wp.int32]
     rules: ResetRules
-    mishaps: wp.array[wp.int32]
+    incidents: wp.array[wp.int32]
     put: wp.array[wp.bool]
     put_poses: wp.array[wp.vec3]
     set_back: wp.array[wp.float32]

@@ -27,33 +27,33 @@ from worker.simulation.worlds import WorldArrays
 
 wp.set_module_options({"enable_backward": False})
 
-MISHAPS = ("crashed", "off_track", "immobilized", "reversed")
-"""Mishaps, by the name of their termination; number n is n + 1 in ``CarArrays.mishaps``. Of several at once the first one counts."""
-COUNTS = (*MISHAPS, "resets")
+INCIDENTS = ("crashed", "off_track", "immobilized", "reversed")
+"""Incidents, by the name of their termination; number n is n + 1 in ``CarArrays.incidents``. Of several at once the first one counts."""
+COUNTS = (*INCIDENTS, "resets")
 """Counters of an episode: the columns of ``CarArrays.counts``."""
-CRASHED, OFF_TRACK, IMMOBILIZED, REVERSED = (wp.constant(number + 1) for number in range(len(MISHAPS)))
+CRASHED, OFF_TRACK, IMMOBILIZED, REVERSED = (wp.constant(number + 1) for number in range(len(INCIDENTS)))
 RESETS = wp.constant(COUNTS.index("resets"))
 
 
 @wp.func
-def note_mishap(world: int, car: CarArrays):
+def note_incident(world: int, car: CarArrays):
     """After a control step: count what went wrong, and find where the car is to be put, if it is. A lap that is complete stays so."""
-    mishap = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
+    incident = int(0)  # noqa: RUF046 (a variable for Warp, not a constant)
     if car.falling[world] >= car.rules.stuck_steps:
-        mishap = REVERSED
+        incident = REVERSED
     if car.standing[world] >= car.rules.stuck_steps:
-        mishap = IMMOBILIZED
+        incident = IMMOBILIZED
     if car.wheels[world] == 0:
-        mishap = OFF_TRACK
+        incident = OFF_TRACK
     if car.crashed[world]:
-        mishap = CRASHED
+        incident = CRASHED
     if progress_of(world, car) >= 100.0:
-        mishap = 0
-    car.mishaps[world] = mishap
+        incident = 0
+    car.incidents[world] = incident
     car.set_back[world] = 0.0
     put = bool(False)
-    if mishap > 0:
-        car.counts[world, mishap - 1] = car.counts[world, mishap - 1] + 1
+    if incident > 0:
+        car.counts[world, incident - 1] = car.counts[world, incident - 1] + 1
         put = car.rules.continuous and car.counts[world, RESETS] < car.rules.max_resets
     car.put[world] = put
     if put:
@@ -141,9 +141,9 @@ def go_on(world: int, car: CarArrays):
 
 
 @wp.func
-def forget_mishaps(world: int, car: CarArrays):
+def forget_incidents(world: int, car: CarArrays):
     """Resets the counters at the beginning of an episode."""
-    car.mishaps[world] = 0
+    car.incidents[world] = 0
     car.put[world] = False
     car.set_back[world] = 0.0
     for column in range(car.counts.shape[1]):

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from racer.car.resets import MISHAPS
+from racer.car.resets import INCIDENTS
 from racer.car.trace import COLUMNS
 from racer.settings.hyperparameters import deepracer_names
 from shared_store.volume.files import refuse_links, write_json
@@ -53,11 +53,11 @@ def sim_trace(
         length: Of the track's centre line [m].
         control_hz: Control steps a second [Hz].
     """
-    before, chooses = [0.0] * len(MISHAPS), rows[-1][-1] != CONTINUOUS
+    before, chooses = [0.0] * len(INCIDENTS), rows[-1][-1] != CONTINUOUS
     for number, row in enumerate(rows):
         car = dict(zip((*COLUMNS, "reward", "action"), row, strict=True))
-        counts = [car[name] for name in MISHAPS]
-        state = next((name for name, now, then in zip(MISHAPS, counts, before, strict=True) if now > then), "")
+        counts = [car[name] for name in INCIDENTS]
+        state = next((name for name, now, then in zip(INCIDENTS, counts, before, strict=True) if now > then), "")
         before = counts
         state = state or ("in_progress" if number else "prepare")
         if done := number == len(rows) - 1:

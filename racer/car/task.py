@@ -127,16 +127,16 @@ class Racer(Task):
             found = self.sensors["race"].reward.failures()
         return {message: (each.count, self.first_world + each.car) for message, each in found.items()}
 
-    def read_mishap(self, code: int) -> tuple[int, str] | None:
-        """As :meth:`Task.read_mishap`, with the error of the reward function."""
-        found = super().read_mishap(code)
+    def read_failed_world(self, code: int) -> tuple[int, str] | None:
+        """As :meth:`Task.read_failed_world`, with the error of the reward function."""
+        found = super().read_failed_world(code)
         if found is None or "reward" not in found[1]:
             return found
         return found[0], ": ".join((found[1], *list(self.failures())[:1]))
 
-    def is_users_fault(self, mishap: str) -> bool:
+    def is_users_fault(self, cause: str) -> bool:
         """Whether a learner's reward function gave no reward."""
-        return self.race is not None and "reward" in mishap
+        return self.race is not None and "reward" in cause
 
     def begins_anew(self) -> str:
         """What a function in Python workers remembers."""
@@ -182,7 +182,7 @@ class Racer(Task):
             metrics={
                 "progress": Metric(racing.final_progress, at_end=True, shown="%"),
                 "lap_time": Metric(racing.lap_time, at_end=True),
-                **mishap_metrics(config),
+                **incident_metrics(config),
             },
             success="lap_complete",
             sensors=self.sensors_of(config),
@@ -362,7 +362,7 @@ def resetting(config: RacerConfig) -> Mapping[str, Event]:
     return {"put_back": Event(resets.put_back, when="interval", seconds=(step, step))} if config.continuous else {}
 
 
-def mishap_metrics(config: RacerConfig) -> Mapping[str, Metric]:
+def incident_metrics(config: RacerConfig) -> Mapping[str, Metric]:
     """Metrics if cars are put back: how often and why, and the penalties [s]."""
     if not config.continuous:
         return {}

@@ -69,9 +69,15 @@ def race_or_evaluate(
     ] = False,
 ) -> None:
     """Evaluate a checkpoint, or have it drive a race. Raises what :func:`.follow_evaluation` raises."""
-    rules = {"trials": trials, "continuous": continuous, "penalty": penalty, "track": track or None, "output": output}
-    rules["overwrite"] = overwrite or None
-    _refuse_mixed(race, {"episodes": arguments["episodes"], "worlds": arguments["worlds"]}, rules)
+    race_options = {
+        "trials": trials,
+        "continuous": continuous,
+        "penalty": penalty,
+        "track": track or None,
+        "output": output,
+        "overwrite": overwrite or None,
+    }
+    _refuse_mixed(race, {"episodes": arguments["episodes"], "worlds": arguments["worlds"]}, race_options)
     if not race:
         evaluate(**arguments)
         return
@@ -87,14 +93,14 @@ def race_or_evaluate(
         "crash_penalty": penalty,
         "accept_changed_robot": arguments["accept_changed_robot"] or None,
     }
-    modes = {key: arguments[key] for key in ("queue", "engine", "store", "cpus", "follow", "dry_run", "as_json")}
+    submission = {key: arguments[key] for key in ("queue", "engine", "store", "cpus", "follow", "dry_run", "as_json")}
 
     def copy(run: Path, evaluation: str) -> None:
         if output is not None:
             _copy(run, evaluation, output, arguments["as_json"])
 
-    what = arguments["source"], section, arguments["set_"], arguments["name"]
-    raise typer.Exit(follow_evaluation(*what, kind="race", then=copy, **modes))
+    evaluation = arguments["source"], section, arguments["set_"], arguments["name"]
+    raise typer.Exit(follow_evaluation(*evaluation, kind="race", then=copy, **submission))
 
 
 OPTIONS = FurtherOptions(
@@ -102,9 +108,9 @@ OPTIONS = FurtherOptions(
 )
 
 
-def _refuse_mixed(race: bool, episodes: dict[str, Any], rules: dict[str, Any]) -> None:
+def _refuse_mixed(race: bool, episode_options: dict[str, Any], race_options: dict[str, Any]) -> None:
     """Refuse options of races without --race, and other options with it. Raises UsageError."""
-    wrong = [name for name, value in (episodes if race else rules).items() if value is not None]
+    wrong = [name for name, value in (episode_options if race else race_options).items() if value is not None]
     if wrong:
         instead = "a race takes --trials instead, one world each" if race else "only races take it; add --race"
         raise UsageError(f"--{wrong[0]}: {instead}")

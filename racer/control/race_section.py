@@ -15,7 +15,7 @@ class Race(OfCheckpoint):
 
     trials: int = Field(default=TRIALS, ge=1, le=100, description="laps")
     continuous: bool = Field(
-        default=DEFAULTS["continuous"], description="whether a car is put back; else a lap ends with its first mishap"
+        default=DEFAULTS["continuous"], description="whether a car is put back; else a lap ends with its first incident"
     )
     off_track_penalty: float = Field(default=DEFAULTS["off_track_penalty"], ge=0, description="of each time [s]")
     crash_penalty: float = Field(default=DEFAULTS["crash_penalty"], ge=0, description="of each obstacle [s]")

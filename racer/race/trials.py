@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 COMPLETE = "lap_complete"
 _CALLED = {"off_tracks": "off_track", "crashes": "crashed", "immobilized": "immobilized", "reversed": "reversed"}
-"""A trial's names for the counts of mishaps."""
+"""A trial's names for the counts of incidents."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ class RewardFunction:
 
     Attributes:
         race: The arrays that a step fills before the call (:class:`racer.rewards.compiled_function.RaceArrays`).
-        function: The Warp function ``(world: int, race: RaceArrays) -> float``, which a declared task can name as a reward term; None
+        function: The Warp function ``(world: int, race: RaceArrays) -> float``, which a task can name as a reward term; None
             where it runs in Python workers.
         reason: Why it is not compiled, one line; empty where it is.
         notes: What the compiled function leaves out, a line each.

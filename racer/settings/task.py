@@ -186,11 +186,7 @@ class RacerConfig(TaskConfig):
     - ``crashed``: touching an obstacle, once;
 
     or, with a ``reward_function``, of the one term ``reward``: its result."""
-    ppo: PPOConfig = field(
-        default_factory=lambda: PPOConfig(
-            steps=32, hidden_sizes=(64, 64), epochs=5, minibatches=4, learning_rate=1.0e-3, entropy_coef=0.002
-        )
-    )
+    ppo: PPOConfig = field(default_factory=lambda: PPOConfig(entropy_coef=0.002))
     """Settings of the task's training."""
 
     def __post_init__(self) -> None:
@@ -306,16 +302,13 @@ class RacerPixelsConfig(RacerConfig):
     """The camera."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
-            steps=32,
             hidden_sizes=(128,),
-            channels=(16, 32, 32),
             epochs=4,
             minibatches=8,
             learning_rate=5.0e-4,
             entropy_coef=0.002,
             critic_observations="critic",
             critic_hidden_sizes=(128, 128),
-            normalize_observations=True,
         )
     )
     """Settings of the task's training; the critic also sees the numbers."""

@@ -61,7 +61,9 @@ def lines(summary: Mapping[str, Any]) -> Iterator[str]:
         f"checkpoint {summary['checkpoint']}, seed {summary.get('seed')}"
     )
     put = (
-        f"put back, {rules['max_resets']} times at most" if rules["continuous"] else "a lap ends with the first mishap"
+        f"put back, {rules['max_resets']} times at most"
+        if rules["continuous"]
+        else "a lap ends with the first incident"
     )
     penalties = f"{rules['off_track_penalty']:g} s off the track, {rules['crash_penalty']:g} s for a crash"
     yield f"rules: {put}; {penalties}; {rules['seconds']:g} s for a lap"

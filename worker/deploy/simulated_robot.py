@@ -38,7 +38,7 @@ NOT_MEASURED = np.array([-1.0] + [0.0] * 8)
 
 
 class SimulatedRobot:
-    """One world of a declared task as the messages of a robot.
+    """One world of a task as the messages of a robot.
 
     Args:
         task: One world on the CPU.

@@ -19,12 +19,12 @@ volume does not take, save stall [s], iteration time [s], iterations that a stop
 
 
 class Exchange:
-    """Sums over the ranks: the task's statistics, its mishaps and the :data:`SIGNALS`."""
+    """Sums over the ranks: the task's statistics, its failed worlds and the :data:`SIGNALS`."""
 
     def __init__(self, gang: Gang, task: Task) -> None:
         self._gang, self._task = gang, task
-        # of each rank: the seconds of its previous rollout, and its mishap (see Task.read_mishap)
-        of_ranks = {"collected": gang.size, "mishap": gang.size}
+        # of each rank: the seconds of its previous rollout, and its failed world (see Task.read_failed_world)
+        of_ranks = {"collected": gang.size, "failed_world": gang.size}
         sizes = {**of_ranks, "statistics": len(task.statistic_names), "signals": len(SIGNALS)}
         self._totals = Totals(sizes, gang.device)
         self._own = torch.zeros(1 + len(SIGNALS), dtype=torch.float64, pin_memory=gang.device != "cpu")
@@ -39,7 +39,7 @@ class Exchange:
         """
         totals, rank = self._totals, self._gang.rank
         totals.values.zero_()
-        totals["mishap"][rank].copy_(self._task.mishap[0])
+        totals["failed_world"][rank].copy_(self._task.failed_world[0])
         totals["statistics"].copy_(self._task.statistics)
         self._task.clear_statistics()
         # the device has copied the previous iteration's values: read() waited for it

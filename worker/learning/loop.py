@@ -243,7 +243,7 @@ class Loop:
         if self.iterated == 1:
             check_names(learnt, record, self.training.algorithm)
         if record.get("nan_worlds"):
-            self._judge_resets(int(record["nan_worlds"]), totals["mishap"])
+            self._judge_resets(int(record["nan_worlds"]), totals["failed_world"])
         return record | learnt | straggler(totals["collected"]), signals
 
     def _failure(self, what: str, hint: str, cause: str = "") -> TrainingError:
@@ -252,12 +252,12 @@ class Loop:
         last = f"checkpoint {self.state.saved_at} stands" if self.state.saved_at else "there is no checkpoint yet"
         return TrainingError(f"iteration {self.state.progress.iteration}: {what}; {last}. {hint}", cause)
 
-    def _judge_resets(self, resets: int, mishaps: list[float]) -> None:
+    def _judge_resets(self, resets: int, failed_worlds: list[float]) -> None:
         """Log worlds that were reset because of a non-finite value or failed physics. Raises TrainingError if they are too many,
         and UserError where another attempt would not do better."""
         total, iteration = self.share.total, self.state.progress.iteration
-        found = [self.task.read_mishap(int(code)) for code in mishaps]
-        rank, (world, cause) = next((rank, mishap) for rank, mishap in enumerate(found) if mishap)
+        found = [self.task.read_failed_world(int(code)) for code in failed_worlds]
+        rank, (world, cause) = next((rank, failed_world) for rank, failed_world in enumerate(found) if failed_world)
         world += WorldShare.of(rank, self.gang.size, total).first
         what = f"{counted(resets, 'reset')} of worlds, among them world {world}: {cause}"
         if resets <= math.ceil(self.config.nan_limit * total):

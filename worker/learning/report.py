@@ -144,16 +144,16 @@ class Report:
         """Print and store one iteration's ``record``."""
         width = len(str(self._iterations))
         shown = "".join(f"{name} {text}  " for name, text in record.get("shown", {}).items())
-        mishaps = "".join(
+        notes = "".join(
             f"  {name} {record[name]:.0f}" for name in ("nan_worlds", "solver_overflows") if record.get(name)
         )
         excess = record.get("slowest_excess") or 0.0
         if excess > _SLOW and excess * (record["collect_seconds"] or 0.0) > _NOTICED:
-            mishaps += f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)"
+            notes += f"  slow: rank {record['slowest_rank']} (+{100 * excess:.0f} %)"
         print(
             f"iteration {record['iteration']:>{width}}/{self._iterations}  reward {_text(record['reward'], '.2f')}  "
             f"length {_text(record['episode_length'], '.1f')}  {shown}steps/s {record['steps_per_second']:.0f}  "
-            f"{in_log(record)}{mishaps}",
+            f"{in_log(record)}{notes}",
             flush=True,
         )
         if record["iteration"] == self._rated_at and (warning := self._long(record)):

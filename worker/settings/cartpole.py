@@ -52,9 +52,7 @@ class CartpoleConfig(TaskConfig):
             hidden_sizes=(32, 32),
             epochs=4,
             minibatches=2,
-            learning_rate=1.0e-3,
             learning_rate_horizon=60,  # by then it balances; the few samples of an iteration allow no large steps afterwards
-            desired_kl=0.01,
         )
     )
     """Settings of the task's training: a small network, since the task is easy and often runs on a CPU."""
@@ -90,11 +88,7 @@ class CartpolePixelsConfig(CartpoleConfig):
         default_factory=lambda: PPOConfig(
             steps=16,
             hidden_sizes=(64,),
-            channels=(16, 32, 32),
             epochs=4,
-            minibatches=4,
-            learning_rate=1.0e-3,
-            desired_kl=0.01,
             normalize_observations=False,
         )
     )

@@ -19,7 +19,7 @@ Weight = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid", strict=True))
 class PPOConfig:
-    """Proximal policy optimisation for one task.
+    """Proximal policy optimisation for one task. A shipped task names only the settings that differ from these, with images or without.
 
     Raises:
         ValueError: A value has the wrong type or is out of range; the message names the field.

@@ -85,11 +85,6 @@ class QuadrupedConfig(TaskConfig):
         default_factory=lambda: PPOConfig(
             steps=24,
             hidden_sizes=(128, 128, 128),
-            activation="elu",
-            epochs=5,
-            minibatches=4,
-            learning_rate=1.0e-3,
-            desired_kl=0.01,
             entropy_coef=0.005,
             init_std=0.6,
         )

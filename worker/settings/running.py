@@ -61,13 +61,8 @@ class RunningConfig(TaskConfig):
     """Factor on the torso's angular velocity in observations [s/rad]."""
     ppo: PPOConfig = field(
         default_factory=lambda: PPOConfig(
-            steps=32,
             hidden_sizes=(400, 200, 100),
-            activation="elu",
-            epochs=5,
-            minibatches=4,
             learning_rate=5.0e-4,
-            desired_kl=0.01,
         )
     )
     """Settings of the task's training."""

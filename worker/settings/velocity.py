@@ -53,16 +53,8 @@ PPO = PPOConfig(
     steps=24,
     hidden_sizes=(512, 256, 128),
     critic_observations="critic",
-    activation="elu",
-    epochs=5,
-    minibatches=4,
-    learning_rate=1.0e-3,
     learning_rate_horizon=500,  # it takes as long to walk
-    desired_kl=0.01,
     entropy_coef=0.01,
-    gamma=0.99,
-    lam=0.95,
-    init_std=1.0,
     max_std=10.0,  # actions have no range in which more noise would cost nothing
 )
 """That of mjlab's ``rl_cfg.py``, the same for both robots, with limits of rate and deviation that do not touch the time of learning."""

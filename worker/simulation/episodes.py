@@ -20,8 +20,8 @@ RESET = wp.constant(1)
 
 ACTION_LIMIT = wp.constant(1.0)
 """Actions are clipped to plus and minus this."""
-NO_MISHAP = wp.constant(2**31 - 1)
-"""Value of ``EpisodeArrays.mishap`` without a failure."""
+NO_FAILED_WORLD = wp.constant(2**31 - 1)
+"""Value of ``EpisodeArrays.failed_world`` without a failure."""
 RETURN = wp.constant(0)
 STEPS = wp.constant(1)
 TERMS = wp.constant(2)
@@ -64,9 +64,9 @@ class EpisodeArrays:
         activations: State of the worlds' stateful actuators, shape ``(worlds, activations)``.
         broken: First column of the last observation groups that was not finite, plus 1; the columns of further groups follow those of
             ``observations``; 0 where all were finite; shape ``(worlds,)``.
-        causes_of_mishaps: How many causes :func:`mishap_code` tells apart.
-        mishap: Least :func:`mishap_code` of the worlds that were reset because of NaN since the statistics were cleared, else
-            :data:`NO_MISHAP`; shape ``(1,)``.
+        failure_causes: How many causes :func:`failed_world_code` tells apart.
+        failed_world: Least :func:`failed_world_code` of the worlds that were reset because of NaN since the statistics were cleared, else
+            :data:`NO_FAILED_WORLD`; shape ``(1,)``.
         last_sums: The ``sums`` of the world's last episode that ended, shape ``(worlds, 2 + terms)``.
         causes: Why that episode ended, see :data:`TERMINATED`; shape ``(worlds,)``.
         successes: Whether the last step was a success, if the task defines success; shape ``(worlds,)``.
@@ -94,8 +94,8 @@ class EpisodeArrays:
     warm_start: wp.array2d[wp.float32]
     activations: wp.array2d[wp.float32]
     broken: wp.array[wp.int32]
-    causes_of_mishaps: int
-    mishap: wp.array[wp.int32]
+    failure_causes: int
+    failed_world: wp.array[wp.int32]
     last_sums: wp.array2d[wp.float32]
     causes: wp.array[wp.int32]
     successes: wp.array[wp.bool]
@@ -151,8 +151,8 @@ def begin_episode(episodes: EpisodeArrays, world: int):
 
 
 @wp.func
-def mishap_code(episodes: EpisodeArrays, world: int, valid: bool) -> int:
-    """World and cause as one number, the lower worlds first; :func:`read_mishap` takes it apart.
+def failed_world_code(episodes: EpisodeArrays, world: int, valid: bool) -> int:
+    """World and cause as one number, the lower worlds first; :func:`read_failed_world` takes it apart.
 
     Only a step in which the world failed computes it. The reward terms are judged by their sums over the episode, which were finite before.
     """
@@ -166,11 +166,11 @@ def mishap_code(episodes: EpisodeArrays, world: int, valid: bool) -> int:
         for term in range(terms):
             if cause == 1 and not wp.isfinite(episodes.sums[world, TERMS + term]):
                 cause = 2 + term
-    return world * episodes.causes_of_mishaps + cause
+    return world * episodes.failure_causes + cause
 
 
-def mishap_causes(rewards: Sequence[str], observations: Sequence[str]) -> list[str]:
-    """The causes that :func:`mishap_code` tells apart, in words.
+def causes_of_failures(rewards: Sequence[str], observations: Sequence[str]) -> list[str]:
+    """The causes that :func:`failed_world_code` tells apart, in words.
 
     Args:
         rewards: Names of the reward terms.
@@ -184,8 +184,8 @@ def mishap_causes(rewards: Sequence[str], observations: Sequence[str]) -> list[s
     ]
 
 
-def read_mishap(code: int, causes: Sequence[str]) -> tuple[int, str]:
-    """World and cause in a ``code`` other than :data:`NO_MISHAP`: the index of the world in this task, and which of ``causes`` it was."""
+def read_failed_world(code: int, causes: Sequence[str]) -> tuple[int, str]:
+    """World and cause in a ``code`` other than :data:`NO_FAILED_WORLD`: the index of the world in this task, and which of ``causes`` it was."""
     world, cause = divmod(code, len(causes))
     return world, causes[cause]
 
@@ -226,7 +226,7 @@ def end_step(
         overflow[world] = 0
         wp.atomic_add(episodes.statistics, TERMS + terms + 2, wp.float64(1.0))
     if not sound:
-        wp.atomic_min(episodes.mishap, 0, mishap_code(episodes, world, valid))
+        wp.atomic_min(episodes.failed_world, 0, failed_world_code(episodes, world, valid))
         episodes.rewards[world] = 0.0
         wp.atomic_add(episodes.statistics, TERMS + terms + 1, wp.float64(1.0))
     else:

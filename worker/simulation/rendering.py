@@ -37,17 +37,20 @@ def displace(
     position: wp.vec3f,
     angle: wp.vec3f,
     episodes: EpisodeArrays,
-    supplied: wp.array[wp.transformf],
+    usual_poses: wp.array[wp.transformf],
     poses: wp.array[wp.transformf],
 ):
     """Pose of one world's camera: drawn once from stream ``number``, that is from the seed and the world alone."""
     world = wp.tid()
-    poses[world] = displaced(supplied[world], numbered_stream(episodes, world, number), position, angle)
+    poses[world] = displaced(usual_poses[world], numbered_stream(episodes, world, number), position, angle)
 
 
 @wp.kernel
 def _paint(colors: float, episodes: EpisodeArrays, shape_colors: wp.array2d[wp.vec3f]):
-    """The colours of one world's shapes: drawn once, behind the six numbers of its camera's pose."""
+    """The colours of one world's shapes: drawn once, behind the six numbers of its camera's pose.
+
+    Not a ``Randomize``: those change the solver's model, and images show Newton's.
+    """
     world = wp.tid()
     stream = numbered_stream(episodes, world, _STREAM)
     for _ in range(6):
@@ -68,7 +71,7 @@ def _draw_light(ends: wp.vec2, episodes: EpisodeArrays, light: wp.array[wp.float
 
 
 @wp.func
-def push(
+def push_pixel(
     images: wp.array4d[wp.uint8],
     world: int,
     channel: int,

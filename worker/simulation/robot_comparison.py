@@ -225,9 +225,11 @@ def _contacts(twins: Twins) -> Iterator[RobotDifference]:
             yield RobotDifference(f"geoms {names}", "contact", words[mine], words[not mine])
 
 
-def _ends(twins: Twins, element: str, words: Sequence[str], here: Ends, other: Ends) -> Iterator[RobotDifference]:
+def _ends(
+    twins: Twins, element: str, words: Sequence[str], in_muster: Ends, in_file: Ends
+) -> Iterator[RobotDifference]:
     """The ends of an element that are others than in the file, by the attributes that name them."""
-    for word, mine, theirs in zip(words, here, other, strict=False):
+    for word, mine, theirs in zip(words, in_muster, in_file, strict=False):
         if mine != theirs:
             yield RobotDifference(element, word, twins.shown_end(mine), twins.shown_end(theirs))
 

@@ -125,9 +125,9 @@ def _compare_body(both: UsdStage, prim: Any) -> None:
         builder.body_inv_mass[index] = 1.0 / mass
     center = authored(prim, "physics:centerOfMass")
     if center is not None and all(map(math.isfinite, center)):
-        other = wp.transform_point(wp.transform_inverse(pose), both.point(prim, center))
+        in_file = wp.transform_point(wp.transform_inverse(pose), both.point(prim, center))
         both.correct(
-            element, "physics:centerOfMass", builder.body_com, index, other, within=1e-6 + 1e-5 * wp.length(other)
+            element, "physics:centerOfMass", builder.body_com, index, in_file, within=1e-6 + 1e-5 * wp.length(in_file)
         )
     moments = authored(prim, "physics:diagonalInertia")
     if moments is not None and any(moments) and authored(prim, "newton:inertia") is None:

@@ -64,8 +64,8 @@ def faults(both: UsdStage) -> Iterator[str]:
             child, count = builder.body_label[builder.joint_child[index]], sum(builder.joint_dof_dim[index])
             if ends and child not in ends:
                 yield f"joint {path} moves {child}, in the file one of {some([*ends])}"
-            if count != (other := _freedoms(prim)):
-                yield f"joint {path} has {count} degrees of freedom, in the file {other}"
+            if count != (in_file := _freedoms(prim)):
+                yield f"joint {path} has {count} degrees of freedom, in the file {in_file}"
 
 
 def compare(both: UsdStage) -> None:
@@ -145,9 +145,9 @@ def _compare_frames(both: UsdStage, prim: Any, index: int) -> bool:
             continue  # on the world's side tools write many things: the place of the body is compared
         target = both.stage.GetPrimAtPath(relation.GetTargets()[0])
         frame = both.pose(target, position.Get(), rotation.Get())
-        other = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
-        if not same_pose(wp.transform(*frames[index]), other):
-            both.correct(element, f"physics:localPos{end} and localRot{end}", frames, index, other)
+        in_file = wp.transform_inverse(wp.transform(*builder.body_q[body])) * frame
+        if not same_pose(wp.transform(*frames[index]), in_file):
+            both.correct(element, f"physics:localPos{end} and localRot{end}", frames, index, in_file)
     return reversed_
 
 
@@ -155,8 +155,8 @@ def _compare_axes(both: UsdStage, prim: Any, index: int, reversed_: bool) -> Non
     builder, element = both.builder, f"joint {prim.GetPath()}"
     axis = prim.GetAttribute("physics:axis").Get() if prim.HasAttribute("physics:axis") else None
     if sum(builder.joint_dof_dim[index]) == 1 and axis:
-        other = wp.vec3(*((-1.0 if reversed_ else 1.0) if axis == letter else 0.0 for letter in "XYZ"))
-        both.correct(element, "physics:axis", builder.joint_axis, builder.joint_qd_start[index], other)
+        in_file = wp.vec3(*((-1.0 if reversed_ else 1.0) if axis == letter else 0.0 for letter in "XYZ"))
+        both.correct(element, "physics:axis", builder.joint_axis, builder.joint_qd_start[index], in_file)
     elif sum(builder.joint_dof_dim[index]) > 1 and reversed_:
         moved = builder.body_label[builder.joint_child[index]]
         both.differ(element, "the body that it moves", moved, "the other one")
@@ -200,20 +200,20 @@ def _compare_limits(both: UsdStage, prim: Any, dof: int, freedom: str) -> None:
     for name, values in zip(names, (both.builder.joint_limit_lower, both.builder.joint_limit_upper), strict=True):
         limit = authored(prim, prefix + name)
         if limit is not None and not shift:
-            other = float(limit) * (DEGREE if freedom in ANGULAR else 1.0)
-            both.correct(f"joint {prim.GetPath()}", prefix + name, values, dof, other)
+            in_file = float(limit) * (DEGREE if freedom in ANGULAR else 1.0)
+            both.correct(f"joint {prim.GetPath()}", prefix + name, values, dof, in_file)
 
 
 def _compare_numbers(both: UsdStage, prim: Any, dof: int, freedom: str) -> None:
     element, angle = f"joint {prim.GetPath()}", DEGREE if freedom in ANGULAR else 1.0
     for field, (word, *names) in NUMBERS.items():
-        other = authored(prim, *names)
-        if other is not None:
-            both.correct(element, word, getattr(both.builder, field), dof, float(other))
+        in_file = authored(prim, *names)
+        if in_file is not None:
+            both.correct(element, word, getattr(both.builder, field), dof, float(in_file))
     degrees, damping = authored(prim, "newton:damping"), authored(prim, "mjc:damping")
     if degrees is not None or damping is not None:
-        other = float(degrees) / angle if degrees is not None else float(np.ravel(damping)[0])
-        both.correct(element, "damping", both.builder.joint_damping, dof, other)
+        in_file = float(degrees) / angle if degrees is not None else float(np.ravel(damping)[0])
+        both.correct(element, "damping", both.builder.joint_damping, dof, in_file)
 
 
 def _compare_drive(both: UsdStage, prim: Any, dof: int, freedom: str, actuator: int | None) -> None:
@@ -231,9 +231,9 @@ def _compare_drive(both: UsdStage, prim: Any, dof: int, freedom: str, actuator: 
     if drive.GetTypeAttr().Get() != "force":
         both.differ(element, "type", "force", drive.GetTypeAttr().Get())
     bias = actuator_value(builder, "actuator_biasprm", actuator)
-    for word, built, other in (("stiffness", -bias[1], stiffness), ("damping", -bias[2], damping)):
-        if not same(built, other):
-            both.differ(element, word, built, other)
+    for word, built, in_file in (("stiffness", -bias[1], stiffness), ("damping", -bias[2], damping)):
+        if not same(built, in_file):
+            both.differ(element, word, built, in_file)
     limit = drive.GetMaxForceAttr().Get()
     if limit is not None and math.isfinite(limit):
         limit = min(float(limit), builder.joint_effort_limit[dof])  # the joint may have a smaller one of its own

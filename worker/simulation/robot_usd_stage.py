@@ -64,8 +64,8 @@ class UsdStage:
 
     def point(self, prim: Any, local: Any) -> Any:
         """A point in a prim's own coordinates, in the world [m]."""
-        other = self._poses.GetLocalToWorldTransform(prim).Transform(local)
-        return wp.transform_point(self._turned, wp.vec3(*other))
+        in_stage = self._poses.GetLocalToWorldTransform(prim).Transform(local)
+        return wp.transform_point(self._turned, wp.vec3(*in_stage))
 
     def pose(self, prim: Any, position: Any = (0.0, 0.0, 0.0), rotation: Any = None) -> wp.transform:
         """A frame on a prim, in the world; scales move its origin only."""
@@ -112,10 +112,10 @@ def plain(value: Any) -> Any:
 
 def same(built: Any, file: Any, within: float = 0.0) -> bool:
     """Whether two values are equal; of two infinite ones the sign counts, and Newton's greatest number is infinite."""
-    here, other = (np.ravel(plain(value)).astype(np.float64) for value in (built, file))
-    here = np.where(np.abs(here) >= newton.MAXVAL, np.copysign(np.inf, here), here)
-    finite = np.abs(other[np.isfinite(other)])
-    return bool(np.allclose(here, other, rtol=0.0, atol=within or 1e-7 + RELATIVE * finite.max(initial=0.0)))
+    in_muster, in_file = (np.ravel(plain(value)).astype(np.float64) for value in (built, file))
+    in_muster = np.where(np.abs(in_muster) >= newton.MAXVAL, np.copysign(np.inf, in_muster), in_muster)
+    finite = np.abs(in_file[np.isfinite(in_file)])
+    return bool(np.allclose(in_muster, in_file, rtol=0.0, atol=within or 1e-7 + RELATIVE * finite.max(initial=0.0)))
 
 
 def same_pose(built: wp.transform, file: wp.transform) -> bool:

@@ -26,7 +26,7 @@ from shared_store.volume.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, L
 
 _BLOCK = 32 << 10
 """Bytes between two marks."""
-_BARREN = 64 << 20
+_MOST_SKIPPED = 64 << 20
 """Bytes without an event that one look reads: a program can make its log a hole of any size."""
 _ENDS = 256 << 10
 """Bytes at either end of a file that are read for its first and its last time: more than one line."""
@@ -70,7 +70,7 @@ class LogFile:
         self.path, self.stream = path, stream
         self.source = int.from_bytes(hashlib.sha256(stream.encode()).digest()) % 10**24
         self._lock = threading.Lock()
-        self._started, self._barren = 0, 0
+        self._started, self._skipped = 0, 0
         self._forget()
 
     def look(self) -> LogSnapshot:
@@ -79,11 +79,11 @@ class LogFile:
         A look skips at most 64 MiB that hold no events; the next look continues there.
         """
         with self._lock:
-            self._barren = 0
+            self._skipped = 0
             segments = segments_of(self.path)
             if not segments and self._end:
                 self._forget()
-            while segments and self._barren < _BARREN:
+            while segments and self._skipped < _MOST_SKIPPED:
                 try:
                     if not self._extend(segments):
                         break
@@ -121,7 +121,7 @@ class LogFile:
             if self._end - self._marks[-1][0] >= _BLOCK:  # looks at a growing file must not leave a mark each
                 self._mark(self._end)
             newest = max(_STAMPS.findall(chunk.data, start, stop), default=b"")
-            self._barren += 0 if newest else stop - start
+            self._skipped += 0 if newest else stop - start
             self._top = max(self._top, milliseconds(newest.decode()))
             self._end, start = chunk.start + stop, stop
         return bool(whole)

@@ -181,9 +181,9 @@ def test_a_transient_launch_error_keeps_the_attempts_and_a_permanent_one_ends_th
 
 
 class Hanging(FakeEngine):
-    """Hangs until a test lets it answer; it stops nothing while ``deaf``."""
+    """Hangs until a test lets it answer; it stops nothing while ``unresponsive``."""
 
-    deaf = False
+    unresponsive = False
 
     def __init__(self) -> None:
         super().__init__()
@@ -191,7 +191,7 @@ class Hanging(FakeEngine):
 
     def stop(self, handle: Handle, grace: float) -> None:
         def step() -> str:
-            if self.deaf:
+            if self.unresponsive:
                 raise NotYet("the daemon is away")
             FakeEngine.stop(self, handle, grace)
             return ""
@@ -267,14 +267,14 @@ def test_a_stop_that_is_not_answered_is_the_job_s_reason_and_tried_again(client:
     hanging.answers.set()
     job = submit_gang(client, "pass", queue="fake")
     await_status(client, job, "RUNNING")
-    hanging.deaf = True
+    hanging.unresponsive = True
     client.batch("TerminateJob", jobId=job, reason="enough")
     output = (
         rf"attempt 1 can't be stopped: the fake engine has not ended gang {job}/1/\d+ within 0\.05 s; "
         "last answer: the daemon is away; trying again"
     )
     wait_for(lambda: re.fullmatch(output, detail(client, job)["statusReason"]), 20, "the reason")
-    hanging.deaf = False
+    hanging.unresponsive = False
     await_status(client, job, "FAILED")
     assert detail(client, job)["statusReason"] == "enough"
 

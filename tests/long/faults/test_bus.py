@@ -213,7 +213,7 @@ def test_two_routers_on_one_machine_do_not_see_each_others_nodes(bus: Bus, tmp_p
 
 
 def test_processes_started_after_the_session_opened_work(bus: Bus) -> None:
-    """A forked copy of a session is deaf and a second open hangs in it: everything we start is executed anew."""
+    """A forked copy of a session receives nothing, and a second open hangs in it: everything we start is executed anew."""
     _, write = os.pipe2(os.O_NONBLOCK)
     node = NodeBus(contract(bus), write)
     node.tend(None)

@@ -1,4 +1,4 @@
-"""Small declared tasks: two sliders with motors, without contacts and gravity, so that every number follows by hand."""
+"""Small tasks: two sliders with motors, without contacts and gravity, so that every number follows by hand."""
 
 from __future__ import annotations
 

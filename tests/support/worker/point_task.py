@@ -89,7 +89,7 @@ class Point(TaskReport):
         self.time_outs = torch.zeros(world_count, dtype=torch.bool)
         self.episode_length = torch.zeros(world_count, dtype=torch.int32)
         self.statistics = torch.zeros(5, dtype=torch.float64)
-        self.mishap = torch.zeros(1, dtype=torch.int32)
+        self.failed_world = torch.zeros(1, dtype=torch.int32)
         self.reset()
 
     def _draw(self, mask: torch.Tensor) -> torch.Tensor:
@@ -182,9 +182,9 @@ class Tripping(Point):
         super().step(actions)
         self.statistics = whole
         self.statistics[-1] += self._trips
-        self.mishap.fill_(self._trips)
+        self.failed_world.fill_(self._trips)
 
-    def read_mishap(self, code: int) -> tuple[int, str] | None:
+    def read_failed_world(self, code: int) -> tuple[int, str] | None:
         return (self.world_count - 1, "it tripped") if code else None
 
 

@@ -28,7 +28,7 @@ def test_an_observation_that_is_not_finite_is_hidden_and_its_world_reset_in_the_
     put(task, joint_q=[[0.0, 0.0], [0.0, 0.0], [0.0, -0.3], [0.0, 0.0]], joint_qd=[[0.0, 0.0]] * 4)
     task.step(STILL)
     assert task.observations[2, 2] == 0 and task.observations.isfinite().all() and not task.dones.any()
-    assert statistics(task)["nan_worlds"] == 0 and task.read_mishap(int(task.mishap)) is None
+    assert statistics(task)["nan_worlds"] == 0 and task.read_failed_world(int(task.failed_world)) is None
     saved = task.state_dict()
     task.step(STILL)
     assert task.dones.tolist() == [False, False, True, False] and not task.time_outs.any()
@@ -36,7 +36,7 @@ def test_an_observation_that_is_not_finite_is_hidden_and_its_world_reset_in_the_
     assert task.observations[2, 1].abs() <= 0.15, "placed afresh"
     totals = statistics(task)
     assert totals["nan_worlds"] == 1 and totals["episodes"] == 0
-    assert task.read_mishap(int(task.mishap)) == (2, "its observation slider_velocity was not finite")
+    assert task.read_failed_world(int(task.failed_world)) == (2, "its observation slider_velocity was not finite")
     # it is part of the state: who resumes between the two steps sees the same
     after = task.state_dict()
     task.load_state_dict(saved)
@@ -49,10 +49,10 @@ def test_physics_and_rewards_are_named_too_and_the_first_world_is_reported() -> 
     put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0], [900.0, 0.0], [0.0, 0.0], [math.nan, 0.0]])
     task.step(STILL)
     assert task.dones.tolist() == [False, True, False, True] and statistics(task)["nan_worlds"] == 2
-    assert task.read_mishap(int(task.mishap)) == (1, "its reward term velocity was not finite")
+    assert task.read_failed_world(int(task.failed_world)) == (1, "its reward term velocity was not finite")
     put(task, joint_q=[[0.0, 0.0]] * 4, joint_qd=[[0.0, 0.0]] * 3 + [[math.nan, 0.0]])
     task.step(STILL)
-    assert task.read_mishap(int(task.mishap)) == (
+    assert task.read_failed_world(int(task.failed_world)) == (
         3,
         "its physics failed (a joint faster than `fastest`, or not finite)",
     )
@@ -65,7 +65,10 @@ def test_a_reward_of_finite_terms_that_overflows_names_none_of_them() -> None:
     task = Cartpole(CartpoleConfig(rewards={"alive": 3e38, "position": 3e38}), 4, seed=1)
     put(task, joint_q=[[0.0, 0.0], [1.0, 0.0], [0.0, 0.0], [0.0, 0.0]], joint_qd=[[0.0, 0.0]] * 4)
     task.step(STILL)
-    assert task.read_mishap(int(task.mishap)) == (1, "its reward was not finite, though each of its terms was")
+    assert task.read_failed_world(int(task.failed_world)) == (
+        1,
+        "its reward was not finite, though each of its terms was",
+    )
 
 
 def test_a_privileged_observation_that_is_not_finite_is_hidden_and_counted_as_the_policys_is() -> None:
@@ -74,12 +77,12 @@ def test_a_privileged_observation_that_is_not_finite_is_hidden_and_counted_as_th
     task.step(STILL)
     critic = task.groups["critic"]
     assert critic[1, 2] == 0 and critic.isfinite().all() and not task.dones.any()
-    assert statistics(task)["nan_worlds"] == 0 and task.read_mishap(int(task.mishap)) is None
+    assert statistics(task)["nan_worlds"] == 0 and task.read_failed_world(int(task.failed_world)) is None
     saved = task.state_dict()
     task.step(STILL)
     assert task.dones.tolist() == [False, True, False, False] and not task.time_outs.any()
     assert statistics(task)["nan_worlds"] == 1
-    assert task.read_mishap(int(task.mishap)) == (1, "its observation critic.root was not finite")
+    assert task.read_failed_world(int(task.failed_world)) == (1, "its observation critic.root was not finite")
     after = task.state_dict()
     task.load_state_dict(saved)
     task.step(STILL)

@@ -81,7 +81,7 @@ def test_two_runs_of_a_race_are_the_same_bit_for_bit() -> None:
     assert len({trial["lap_time"] for trial in first.summary()["trials"]}) > 1  # each trial has a car of its own
 
 
-def test_a_trial_ends_with_its_first_mishap_where_no_car_is_put_back() -> None:
+def test_a_trial_ends_with_its_first_incident_where_no_car_is_put_back() -> None:
     _, played, race = drive(gain=0.0, trials=2, off_track_penalty=3.0)
     message = race.summary()
     for trial in message["trials"]:
@@ -270,7 +270,7 @@ def test_a_car_that_stands_or_comes_back_is_put_back_after_fifteen_steps() -> No
 
 
 @pytest.mark.parametrize("most", [0, 2])
-def test_an_episode_ends_with_the_mishap_after_the_last_reset(most: int) -> None:
+def test_an_episode_ends_with_the_incident_after_the_last_reset(most: int) -> None:
     task = continuous(max_resets=most)
     steps = 0
     while not task.dones[0]:
@@ -286,7 +286,7 @@ def test_an_episode_ends_with_the_mishap_after_the_last_reset(most: int) -> None
     assert counts(task) == dict.fromkeys(COUNTS, 0)  # of the next episode
 
 
-def test_penalties_are_seconds_for_each_mishap_of_their_kind() -> None:
+def test_penalties_are_seconds_for_each_incident_of_their_kind() -> None:
     fields = {"off_track_penalty": 5.0, "crash_penalty": 2.5, "max_resets": 1}
     task = continuous(obstacles=(ObstacleConfig(1.5, "center"),), **fields)
     while not task.dones[0]:  # into the box, then past it and out of the curve

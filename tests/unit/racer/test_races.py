@@ -13,7 +13,7 @@ from shared_store.volume.evaluations import lines
 from tests.support.racer.leagues import race
 
 
-def test_a_race_is_three_laps_that_end_with_the_first_mishap_with_times_in_milliseconds() -> None:
+def test_a_race_is_three_laps_that_end_with_the_first_incident_with_times_in_milliseconds() -> None:
     expected = {"laps": 3, "continuous": False, "off_track_penalty": 1.0, "crash_penalty": 1.0, "max_resets": 100}
     assert rules_of({"run": "fast"}) == {**expected, "seconds": 1200.0, "ranking": None}
     assert rules_of({"trials": 5, "seconds": 60.0})["laps"] == 5

@@ -211,8 +211,8 @@ def test_a_world_whose_function_fails_is_reset_and_counted(prefix: str) -> None:
     (line, found), *others = task.failures().items()
     assert line.startswith("reward.py:") and "ZeroDivisionError" in line and found == (2, 0) and not others
     assert task.statistics[task.statistic_names.index("nan_worlds")] == 2
-    mishap = task.read_mishap(int(task.mishap))
-    assert mishap == (0, f"its reward term reward was not finite: {line}")
+    failed_world = task.read_failed_world(int(task.failed_world))
+    assert failed_world == (0, f"its reward term reward was not finite: {line}")
 
 
 def test_a_function_that_never_returns_ends_the_task_with_one_line() -> None:

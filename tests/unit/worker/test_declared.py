@@ -1,4 +1,4 @@
-"""Declared tasks: what their kernels compute follows from the declaration, by hand."""
+"""Tasks: what their kernels compute follows from the declaration, by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Declared tasks: poses are those of the step in which a term reads them; what a reset forgets, and what a checkpoint keeps."""
+"""Tasks: poses are those of the step in which a term reads them; what a reset forgets, and what a checkpoint keeps."""
 
 from __future__ import annotations
 

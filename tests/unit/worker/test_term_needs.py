@@ -18,7 +18,19 @@ from worker.simulation.sensors.contact import ContactSensor
 from worker.simulation.sensors.frames import Frames
 from worker.simulation.sensors.height_scan import HeightScan, RingPattern
 from worker.simulation.sensors.imu import Imu
-from worker.tasks import Action, Choice, Command, Event, Metric, Observation, Robot, Term, WorldArrays, terms
+from worker.tasks import (
+    Action,
+    Choice,
+    Command,
+    Event,
+    Metric,
+    Observation,
+    Robot,
+    Term,
+    Termination,
+    WorldArrays,
+    terms,
+)
 from worker.tasks.compile.binding import has_columns
 
 TURN = (-1.0, 1.0)
@@ -196,7 +208,13 @@ def _mixed_up(task: Sliders) -> torch.Tensor:
     return torch.arange(2.0 * task.world_count).reshape(2, task.world_count)
 
 
-def test_a_torch_term_of_another_shape_is_refused() -> None:
-    requested = r"observations.a: _mixed_up gives \(2, 3\); expected a tensor of shape \(3, 2\), as size= says$"
+def test_a_torch_term_of_another_shape_is_refused_and_a_column_is_accepted() -> None:
+    requested = r"observations.a: _mixed_up gives shape \(2, 3\); expected .* shape \(3, 2\) for 3 worlds: set size= "
     with pytest.raises(ValueError, match=requested):
         sliders(observations={"a": Observation(_mixed_up, size=2)})(SlidersConfig(), 3)
+    requested = r"terminations.a: _mixed_up gives shape \(2, 3\); expected .* \(3,\) or \(3, 1\) for 3 worlds: reduce "
+    with pytest.raises(ValueError, match=requested):
+        sliders(terminations={"a": Termination(_mixed_up)})(SlidersConfig(), 3).step(torch.zeros(3, 2))
+    task = sliders(terminations={"a": Termination(lambda task: _mixed_up(task)[0, :, None] > 1.0)})(SlidersConfig(), 3)
+    task.step(torch.zeros(3, 2))
+    assert task.dones.tolist() == [False, False, True]

@@ -118,9 +118,8 @@ def test_the_page_of_names_has_all_terms_of_mjlabs_tasks() -> None:
 
 
 def test_no_name_is_both_a_term_here_and_elsewhere() -> None:
-    elsewhere = {name for row in ELSEWHERE.splitlines() for name in re.findall(r"`(\w+)`", row.partition(" | ")[0])}
-    assert len(elsewhere) > 10
-    assert elsewhere & {*aliases("mjlab"), *aliases("isaaclab")} == set()
+    assert len(ELSEWHERE) > 10
+    assert ELSEWHERE.keys() & {*aliases("mjlab"), *aliases("isaaclab")} == set()
 
 
 def test_the_page_on_randomisation_has_all_quantities_of_mjlab_and_names_only_ours() -> None:

@@ -20,7 +20,7 @@ from worker.simulation.rendering import (
     displaced,
     draw_light,
     look,
-    push,
+    push_pixel,
     renderer,
     shaded,
     shapes_of_worlds,
@@ -93,7 +93,7 @@ def _stack_color(
     first = episodes.ages[world] == 0
     for channel in range(3):
         value = to_byte(shaded(pixels[world, row, column], channel, light[world]))
-        push(camera.images, world, channel, 3, row, column, value, first)
+        push_pixel(camera.images, world, channel, 3, row, column, value, first)
 
 
 @wp.kernel
@@ -107,7 +107,7 @@ def _stack_grey(
     world, row, column = wp.tid()
     pixel, bright = pixels[world, row, column], light[world]
     luma = 0.299 * shaded(pixel, 0, bright) + 0.587 * shaded(pixel, 1, bright) + 0.114 * shaded(pixel, 2, bright)
-    push(camera.images, world, 0, 1, row, column, to_byte(luma), episodes.ages[world] == 0)
+    push_pixel(camera.images, world, 0, 1, row, column, to_byte(luma), episodes.ages[world] == 0)
 
 
 @wp.kernel
@@ -122,7 +122,7 @@ def _stack_depth(
     depth = wp.clamp(depth, near, far)
     camera.depths[world, row, column] = depth
     value = to_byte(255.0 * (depth - near) / (far - near))
-    push(camera.images, world, 0, 1, row, column, value, episodes.ages[world] == 0)
+    push_pixel(camera.images, world, 0, 1, row, column, value, episodes.ages[world] == 0)
 
 
 @wp.kernel
@@ -142,7 +142,7 @@ def _stack_masks(
         value = wp.uint8(0)
         if channel == seen:
             value = wp.uint8(255)
-        push(camera.images, world, channel, channels, row, column, value, episodes.ages[world] == 0)
+        push_pixel(camera.images, world, channel, channels, row, column, value, episodes.ages[world] == 0)
 
 
 class Camera(Sensor):
@@ -208,10 +208,10 @@ class Camera(Sensor):
         self._update_poses()
 
     def _displace(
-        self, stream: int, position: Any, angle: Any, supplied: wp.array[wp.transform], poses: wp.array[wp.transform]
+        self, stream: int, position: Any, angle: Any, usual_poses: wp.array[wp.transform], poses: wp.array[wp.transform]
     ) -> None:
-        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, supplied]
-        wp.launch(displace, dim=supplied.shape, inputs=inputs, outputs=[poses], device=self._device)
+        inputs = [stream, wp.vec3(*_three(position)), wp.vec3(*_three(angle)), self._episodes, usual_poses]
+        wp.launch(displace, dim=usual_poses.shape, inputs=inputs, outputs=[poses], device=self._device)
 
     def _update_poses(self) -> None:
         inputs = [self._bodies, self._body, self._mounts, self.arrays]

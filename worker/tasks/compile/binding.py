@@ -127,13 +127,13 @@ class Binder:
         with placed(place):
             found = signature(term.function)
         bound = Bound(place, term, found, width=max(found.width, 1))
-        supplied = dict(found.defaults) | term.parameters
+        parameters = dict(found.defaults) | term.parameters
         if found.element:
             if not element:
                 raise ValueError(
                     f"{place}: {found.name} has a parameter {found.element}, which there is nothing for here"
                 )
-            bound.elements, bound.element_names = self._elements(place, term, found, supplied)
+            bound.elements, bound.element_names = self._elements(place, term, found, parameters)
         self._check_robot(bound)
         known = [name for name, kind in found.parameters.items() if is_named(name, kind, found)]
         for name in term.parameters:
@@ -142,7 +142,7 @@ class Binder:
                     f"{place}: {found.name} has no parameter {name}; {nearest(name, known) or 'it takes none'}"
                 )
         for name, kind in found.parameters.items():
-            bound.arguments[name] = self._argument(bound, name, kind, supplied, own or {})
+            bound.arguments[name] = self._argument(bound, name, kind, parameters, own or {})
         return bound
 
     def _bind_torch(self, place: str, term: Term) -> Bound:
@@ -162,10 +162,10 @@ class Binder:
             raise ValueError(f"{place}: {term.function_name}: {error}") from error
         return bound
 
-    def _indices(self, place: str, term: Term, found: Signature, supplied: Mapping[str, Any]) -> list[str]:
+    def _indices(self, place: str, term: Term, found: Signature, parameters: Mapping[str, Any]) -> list[str]:
         """Names of the elements that a parameter ``index`` counts: columns of sensors, numbers of a command, or ``size`` of them."""
         needed = needs_of(term.function)
-        names, what = self._counted(place, found, supplied, needed)
+        names, what = self._counted(place, found, parameters, needed)
         if term.size is None:
             if not names:
                 raise ValueError(f"{place}: say how often {found.name} is called, with size=")
@@ -175,13 +175,13 @@ class Binder:
         return [str(index) for index in range(term.size)]
 
     def _counted(
-        self, place: str, found: Signature, supplied: Mapping[str, Any], needed: Needs
+        self, place: str, found: Signature, parameters: Mapping[str, Any], needed: Needs
     ) -> tuple[list[str], str]:
         """Names of the values of an index, and a word for what they are; none if the function does not say."""
         if needed.size:
             return [str(index) for index in range(needed.size)], f"elements of {found.name}"
         if needed.numbers:
-            name = self._command_name(place, supplied.get("command"))
+            name = self._command_name(place, parameters.get("command"))
             return [str(index) for index in range(self.visible[name])], f"numbers of the command {name}"
         counts: dict[str, int] = {}
         names: list[str] = []
@@ -190,10 +190,10 @@ class Binder:
                 continue
             if needed.columns is not None and parameter not in needed.columns:
                 continue
-            sensor = self._sensor(place, parameter, kind, supplied.get(parameter))
+            sensor = self._sensor(place, parameter, kind, parameters.get(parameter))
             rows: list[str] = self.sensors[sensor].rows(self.views)
             if needed.points and kind is HeightScanArrays:
-                rows = self._frames_of(place, sensor, rows, needed.points, supplied)
+                rows = self._frames_of(place, sensor, rows, needed.points, parameters)
             counts[sensor] = len(rows)
             names = names or rows
         if len(set(counts.values())) > 1:
@@ -204,9 +204,9 @@ class Binder:
         return names, f"{'frames' if needed.points else 'columns'} of {', '.join(counts)}"
 
     @staticmethod
-    def _frames_of(place: str, sensor: str, rows: list[str], points: str, supplied: Mapping[str, Any]) -> list[str]:
+    def _frames_of(place: str, sensor: str, rows: list[str], points: str, parameters: Mapping[str, Any]) -> list[str]:
         """The frames of a height scan; each has as many columns as the number ``points`` says."""
-        count = supplied.get(points)
+        count = parameters.get(points)
         if isinstance(count, bool) or not isinstance(count, int) or count < 1 or len(rows) % count:
             raise ValueError(
                 f"{place}: {points} is {shown(count)}, and the scan {sensor} has {len(rows)} columns; "
@@ -250,12 +250,12 @@ class Binder:
         return max(count, term.memory)
 
     def _elements(
-        self, place: str, term: Term, found: Signature, supplied: Mapping[str, Any]
+        self, place: str, term: Term, found: Signature, parameters: Mapping[str, Any]
     ) -> tuple[list[int], list[str]]:
         element = found.element
         assert element is not None
         if element == "index":
-            names = self._indices(place, term, found, supplied)
+            names = self._indices(place, term, found, parameters)
             return list(range(len(names))), names
         if element == "action":
             if not self.actions:
@@ -272,7 +272,9 @@ class Binder:
             raise ValueError(f"{place}: the task has no robot or object {name!r}; {nearest(name, list(self.views))}")
         return self.views[name]
 
-    def _argument(self, bound: Bound, name: str, kind: Any, supplied: Mapping[str, Any], own: Mapping[str, str]) -> str:
+    def _argument(
+        self, bound: Bound, name: str, kind: Any, parameters: Mapping[str, Any], own: Mapping[str, str]
+    ) -> str:
         place, term = bound.place, bound.term
         if name in own:
             return own[name]
@@ -289,18 +291,18 @@ class Binder:
             first, self.lasting = self.lasting, self.lasting + term.lasting
             return str(first)
         if name == "command":
-            return str(self._command(bound, supplied.get("command")))
+            return str(self._command(bound, parameters.get("command")))
         if is_struct(kind):
-            return self._struct(bound, name, kind, supplied)
+            return self._struct(bound, name, kind, parameters)
         if kind not in WIDTHS:
             raise ValueError(f"{place}: {term.function_name} has a parameter {name}, which there is nothing for here")
         if name in ("stream", "value", "choice", "terminated", "joint", "body", "site", "index", "action"):
             raise ValueError(f"{place}: {term.function_name} has a parameter {name}, which there is nothing for here")
-        if name not in supplied:
+        if name not in parameters:
             raise ValueError(f"{place}: {term.function_name} needs {name}={shown_type(kind)}")
         # the divisor of a scan's columns is part of the kernel's bounds
-        check = stays(supplied[name]) if name == needs_of(term.function).points else None
-        first = self.numbers.add(f"{place}.{name}", supplied[name], WIDTHS[kind], check)
+        check = stays(parameters[name]) if name == needs_of(term.function).points else None
+        first = self.numbers.add(f"{place}.{name}", parameters[name], WIDTHS[kind], check)
         return EXPRESSIONS[kind].format(*range(first, first + WIDTHS[kind]))
 
     def reserve_command(self, name: str, term: Command) -> None:
@@ -347,14 +349,14 @@ class Binder:
                 f"{bound.place}: {bound.term.function_name} needs a command of {expected}; {command} has {found}"
             )
 
-    def _struct(self, bound: Bound, name: str, kind: Any, supplied: Mapping[str, Any]) -> str:
+    def _struct(self, bound: Bound, name: str, kind: Any, parameters: Mapping[str, Any]) -> str:
         place = bound.place
         if kind in STRUCTS:
             variable = STRUCTS[kind]
         elif is_robot(kind):
             assert bound.signature is not None
             robots = [key for key, each in bound.signature.parameters.items() if is_robot(each)]
-            robot = supplied.get(name, bound.term.robot if name == robots[0] else None)
+            robot = parameters.get(name, bound.term.robot if name == robots[0] else None)
             if robot is None:
                 raise ValueError(f"{place}: say which robot or object {name} is, with {name}=")
             self._view(place, robot)
@@ -364,7 +366,7 @@ class Binder:
                 raise ValueError(f"{place}: {bound.term.function_name} needs a terrain, and the task stands on none")
             variable = "terrain"
         else:
-            variable = f"sensor_{self._sensor(place, name, kind, supplied.get(name))}"
+            variable = f"sensor_{self._sensor(place, name, kind, parameters.get(name))}"
         self.structs[variable] = kind
         return variable
 
@@ -402,10 +404,10 @@ def find(place: str, view: RobotView, element: str, pattern: Pattern | None) -> 
         return found, [view.site_names[each] for each in found]
 
 
-def _function_instead(supplied: Any) -> str:
+def _function_instead(value: Any) -> str:
     """What a term takes instead of a value that is not a function; for the name of a function, that function."""
     known = [f"terms.{name}" for name in dir(terms) if is_warp(getattr(terms, name))]
-    meant = f"terms.{supplied.removeprefix('terms.')}" if isinstance(supplied, str) else ""
+    meant = f"terms.{value.removeprefix('terms.')}" if isinstance(value, str) else ""
     anything = "a term is a @wp.func, or a Python function of the task that gives a tensor"
     return nearest(meant, known, anything, cutoff=0.8)
 

@@ -49,7 +49,10 @@ def push_at_random(
     probability: float,
     velocity: float,
 ):
-    """Now and then change the root's horizontal velocity at once, by up to +- ``velocity`` [m/s] times the curriculum's level."""
+    """Now and then change the root's horizontal velocity at once, by up to +- ``velocity`` [m/s] times the curriculum's level.
+
+    :func:`.push` has no probability and level, and draws six numbers: other bits for the same seed.
+    """
     if wp.randf(stream) < probability:
         for axis in range(2):
             change = episodes.level[0] * velocity * wp.randf(stream, -1.0, 1.0)

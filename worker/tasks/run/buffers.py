@@ -18,14 +18,14 @@ class Buffers:
 
     Args:
         task: The task, whose plan and worlds exist.
-        causes: How many causes of mishaps there are.
+        causes: How many causes of failures there are.
     """
 
     def __init__(self, task: Task, causes: int) -> None:
         self.arrays = arrays = EpisodeArrays()
         worlds, weights = task.worlds.arrays, list(task.plan.weights.values())
         arrays.warm_start, arrays.activations = worlds.warm_start, worlds.activations
-        arrays.causes_of_mishaps = causes
+        arrays.failure_causes = causes
         count, terms, observations = task.world_count, len(weights), len(task.observation_names)
         actions, sums = 1 if task.discrete else task.action_size, 2 + terms + len(task.metric_names)
         for name, shape, dtype in (
@@ -44,7 +44,7 @@ class Buffers:
             ("last_actions", (count, actions), wp.float32),
             ("earlier_actions", (count, actions), wp.float32),
             ("broken", (count,), wp.int32),
-            ("mishap", (1,), wp.int32),
+            ("failed_world", (1,), wp.int32),
             ("weights", (terms,), wp.float32),
             ("level", (1,), wp.float32),
             ("statistics", (len(task.statistic_names),), wp.float64),

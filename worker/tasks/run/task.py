@@ -12,7 +12,14 @@ import warp as wp
 from shared_store.contract.error_text import nearest
 from worker.settings.task import TaskConfig, value_at
 from worker.simulation.capture import CapturedStep, on_torch_stream
-from worker.simulation.episodes import NO_MISHAP, RESET, EpisodeArrays, mishap_causes, randomize_ages, read_mishap
+from worker.simulation.episodes import (
+    NO_FAILED_WORLD,
+    RESET,
+    EpisodeArrays,
+    causes_of_failures,
+    randomize_ages,
+    read_failed_world,
+)
 from worker.simulation.randomizations import Randomizations
 from worker.simulation.rendering import paint
 from worker.simulation.robot_arrays import BodyArrays, RobotArrays
@@ -83,7 +90,7 @@ class Task(TaskSketch):
         episode_length: Steps on the clock of the running episode, shape ``(worlds,)``, int32.
         statistics: Running totals since :meth:`clear_statistics`, named by ``statistic_names``, shape ``(k,)``,
             float64. They are not part of the state: read and clear them before it is saved.
-        mishap: A world that failed and was reset since :meth:`clear_statistics`, and the cause: see :meth:`read_mishap`; shape
+        failed_world: A world that failed and was reset since :meth:`clear_statistics`, and the cause: see :meth:`read_failed_world`; shape
             ``(1,)``, int32.
         ended: The last finished episode of each world, see :class:`worker.tasks.run.episode_records.LastEpisodes`.
         captured: Whether :meth:`step` replays a graph; true after construction, which captures one on trial.
@@ -162,7 +169,7 @@ class Task(TaskSketch):
 
     def _allocate(self) -> None:
         """Allocate every buffer once, as views that torch and Warp share."""
-        self._causes = mishap_causes(self.reward_terms, (*self.observation_names, *self.further_names))
+        self._causes = causes_of_failures(self.reward_terms, (*self.observation_names, *self.further_names))
         self._buffers = buffers = Buffers(self, len(self._causes))
         self._episodes = buffers.arrays
         self.actions = buffers["actions"]
@@ -170,7 +177,7 @@ class Task(TaskSketch):
         self.terminal_observations = buffers["terminal_observations"]
         self.rewards, self.dones, self.time_outs = buffers["rewards"], buffers["dones"], buffers["time_outs"]
         self.episode_length = buffers["ages"]
-        self.mishap, self.statistics = buffers["mishap"], buffers["statistics"]
+        self.failed_world, self.statistics = buffers["failed_world"], buffers["statistics"]
         self.ended = LastEpisodes.of(self, buffers)
 
     def _prepare(self) -> None:
@@ -361,11 +368,11 @@ class Task(TaskSketch):
     def clear_statistics(self) -> None:
         """Set all running totals to zero."""
         self.statistics.zero_()
-        self.mishap.fill_(int(NO_MISHAP))
+        self.failed_world.fill_(int(NO_FAILED_WORLD))
 
-    def read_mishap(self, code: int) -> tuple[int, str] | None:
-        """Decode a value of :attr:`mishap`: the index of the failed world in this task and the cause; None: no world failed."""
-        return None if code == NO_MISHAP else read_mishap(code, self._causes)
+    def read_failed_world(self, code: int) -> tuple[int, str] | None:
+        """Decode a value of :attr:`failed_world`: the index of the failed world in this task and the cause; None: no world failed."""
+        return None if code == NO_FAILED_WORLD else read_failed_world(code, self._causes)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """The state from which :meth:`load_state_dict` continues bit for bit (on the CPU), copied to host memory.

@@ -35,8 +35,8 @@ class TaskReport:
         """
         return {}
 
-    def is_users_fault(self, mishap: str) -> bool:
-        """Whether a function of the user is to blame for a mishap (:meth:`worker.tasks.run.task.Task.read_mishap`), which another attempt repeats."""
+    def is_users_fault(self, cause: str) -> bool:
+        """Whether a function of the user is to blame for a failed world (:meth:`worker.tasks.run.task.Task.read_failed_world`), which another attempt repeats."""
         return False
 
     def begins_anew(self) -> str:

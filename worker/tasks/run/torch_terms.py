@@ -91,10 +91,14 @@ class TorchTerms:
         worlds = self._task.world_count
         fitting = [(worlds, bound.width)] + ([(worlds,)] if bound.width == 1 else [])
         if not isinstance(found, torch.Tensor) or tuple(found.shape) not in fitting:
-            what = tuple(found.shape) if isinstance(found, torch.Tensor) else type(found).__name__
+            what = f"shape {tuple(found.shape)}" if isinstance(found, torch.Tensor) else type(found).__name__
+            observed = bound.place.startswith("observations")
+            remedy = (
+                "set size= to its columns" if observed else "reduce each world's numbers to one, such as by .sum(-1)"
+            )
             raise ValueError(
-                f"task {type(self._task).__name__}: {bound.place}: {bound.term.function_name} gives {what}; "
-                f"expected a tensor of shape ({worlds}, {bound.width}), as size= says"
+                f"task {type(self._task).__name__}: {bound.place}: {bound.term.function_name} gives {what}; expected a tensor "
+                f"of shape {' or '.join(map(str, reversed(fitting)))} for {worlds} worlds: {remedy}"
             )
         assert self._columns is not None
         self._columns[:, bound.external : bound.external + bound.width].copy_(found.reshape(worlds, bound.width))

@@ -1,5 +1,5 @@
 # ruff: noqa: F403
-"""Named terms for declared tasks: small Warp functions for actions, observations, rewards, terminations, commands and events.
+"""Named terms for tasks: small Warp functions for actions, observations, rewards, terminations, commands and events.
 
 A task uses them as ``terms.NAME``. Those that no shipped task needs are in :mod:`worker.tasks.terms.more`, which is imported when one
 of them is used. ``terms.mjlab.NAME`` and ``terms.isaaclab.NAME`` find a term by its name there. ``docs/tasks/terms.md`` lists all terms.

@@ -19,24 +19,60 @@ from worker.tasks.terms import more
 
 LIBRARIES = {"mjlab": "mjlab", "isaaclab": "Isaac Lab"}
 """Libraries by the names of their modules here."""
-ELSEWHERE = """\
-| `commands_vel` | mjlab | of Go1 and G1: `command_forward`, `command_left`, `command_turn` of the configuration, stages by iteration (mjlab's steps / 24); in a task of your own: [`begin_iteration`](../own-task.md#numbers-and-curricula-of-a-job) sets the numbers of the command, since a curriculum gives both ends of a range the same value |
-| `reward_curriculum` | mjlab | [`train.config.curriculum`](../tasks.md#curriculum): a weight by the term's name, another number as `rewards.TERM.NUMBER`; by iteration instead of step, and interpolated: for a jump give two points one iteration apart |
-| `modify_reward_weight` | Isaac Lab | [`train.config.curriculum`](../tasks.md#curriculum), as for mjlab's `reward_curriculum` |
-| `termination_curriculum` | mjlab | [`train.config.curriculum`](../tasks.md#curriculum) of `terminations.TERM.NUMBER`; whether it is a `time_out` stays |
-| `modify_env_param`, `modify_term_cfg` | Isaac Lab | [`train.config.curriculum`](../tasks.md#curriculum) of a number of the declaration; other rules in [`begin_iteration`](../own-task.md#numbers-and-curricula-of-a-job) |
-| `camera_rgb` | mjlab | [`Image`](cameras.md) of a `CameraSensor(kind="color")`, an observation group of its own; bytes, which networks take as -0.5 to 0.5 instead of 0 to 1 |
-| `camera_depth` | mjlab | `Image` of a `CameraSensor(kind="depth")`, `near`: min_depth, `far`: cutoff_distance; 0 is at `near`, theirs at the camera |
-| `camera_segmentation` | mjlab | `Image` of a `CameraSensor(kind="segmentation")`: one channel for each robot, object and the ground, instead of numbers of geoms |
-| `dr.geom_rgba` | mjlab | [`train.config.randomize.colors`](../tasks.md#randomisation): of all shapes, around their own colours, once for each world |
-| `TendonLengthAction`, `TendonVelocityAction`, `TendonEffortAction` | mjlab | nothing like it: actions drive joints, or a frame with `move_frame` |
-| `SiteEffortAction` | mjlab | nothing like it as an action; `apply_wrench`, an event, pushes bodies |
-| `reset_root_state_from_flat_patches` | mjlab | nothing like it: no flat places are looked for; `reset_root_on_terrain` places robots around the middle of their patch |
-| `reset_root_state_from_terrain` | Isaac Lab | nothing like it: no flat places are looked for; `reset_root_on_terrain` places robots around the middle of their patch |
-| `reset_nodal_state_uniform` | Isaac Lab | nothing like it: there are no soft bodies |
-| `OperationalSpaceControllerAction`, `NonHolonomicAction`, `SurfaceGripperBinaryAction` | Isaac Lab | nothing like it |
-"""
-"""Names that are not terms here, their library, and what to use instead: rows of a table in Markdown."""
+_NO_FLAT_PLACES = "nothing like it: flat places are not searched for; `reset_root_on_terrain` places robots around the middle of their patch"
+ELSEWHERE = {
+    "commands_vel": (
+        "mjlab",
+        "of Go1 and G1: `command_forward`, `command_left`, `command_turn` of the configuration, stages by iteration (mjlab's steps / 24); in a task of your own: [`begin_iteration`](../own-task.md#numbers-and-curricula-of-a-job) sets the numbers of the command, since a curriculum gives both ends of a range the same value",
+    ),
+    "reward_curriculum": (
+        "mjlab",
+        "[`train.config.curriculum`](../tasks.md#curriculum): a weight by the term's name, another number as `rewards.TERM.NUMBER`; by iteration instead of step, and interpolated: for a jump give two points one iteration apart",
+    ),
+    "modify_reward_weight": (
+        "isaaclab",
+        "[`train.config.curriculum`](../tasks.md#curriculum), as for mjlab's `reward_curriculum`",
+    ),
+    "termination_curriculum": (
+        "mjlab",
+        "[`train.config.curriculum`](../tasks.md#curriculum) of `terminations.TERM.NUMBER`; whether it is a `time_out` stays",
+    ),
+    "modify_env_param": (
+        "isaaclab",
+        "[`train.config.curriculum`](../tasks.md#curriculum) of a number of the declaration; other rules in [`begin_iteration`](../own-task.md#numbers-and-curricula-of-a-job)",
+    ),
+    "modify_term_cfg": (
+        "isaaclab",
+        "[`train.config.curriculum`](../tasks.md#curriculum) of a number of the declaration; other rules in [`begin_iteration`](../own-task.md#numbers-and-curricula-of-a-job)",
+    ),
+    "camera_rgb": (
+        "mjlab",
+        '[`Image`](cameras.md) of a `CameraSensor(kind="color")`, an observation group of its own; bytes, which networks take as -0.5 to 0.5 instead of 0 to 1',
+    ),
+    "camera_depth": (
+        "mjlab",
+        '`Image` of a `CameraSensor(kind="depth")`, `near`: min_depth, `far`: cutoff_distance; 0 is at `near`, theirs at the camera',
+    ),
+    "camera_segmentation": (
+        "mjlab",
+        '`Image` of a `CameraSensor(kind="segmentation")`: one channel for each robot, object and the ground, instead of numbers of geoms',
+    ),
+    "dr.geom_rgba": (
+        "mjlab",
+        "[`train.config.randomize.colors`](../tasks.md#randomisation): of all shapes, around their own colours, once for each world",
+    ),
+    "TendonLengthAction": ("mjlab", "nothing like it: actions drive joints, or a frame with `move_frame`"),
+    "TendonVelocityAction": ("mjlab", "nothing like it: actions drive joints, or a frame with `move_frame`"),
+    "TendonEffortAction": ("mjlab", "nothing like it: actions drive joints, or a frame with `move_frame`"),
+    "SiteEffortAction": ("mjlab", "nothing like it as an action; `apply_wrench`, an event, pushes bodies"),
+    "reset_root_state_from_flat_patches": ("mjlab", _NO_FLAT_PLACES),
+    "reset_root_state_from_terrain": ("isaaclab", _NO_FLAT_PLACES),
+    "reset_nodal_state_uniform": ("isaaclab", "nothing like it: there are no soft bodies"),
+    "OperationalSpaceControllerAction": ("isaaclab", "nothing like it"),
+    "NonHolonomicAction": ("isaaclab", "nothing like it"),
+    "SurfaceGripperBinaryAction": ("isaaclab", "nothing like it"),
+}
+"""Names that are not terms here: their library, by its module here, and what to use instead, in Markdown."""
 _NAMES = re.compile(r"(?:^|(?<=\.)|(?<=\n))\s*(mjlab|mjlab, Isaac Lab|Isaac Lab): (.*)\.\s*$", re.DOTALL)
 
 
@@ -80,11 +116,11 @@ def term_named(library: str, name: str) -> wp.Function:
     known = aliases(library)
     if name in known:
         return known[name]
-    for row in ELSEWHERE.splitlines():
-        names, owner, instead = (each.strip() for each in row.strip("|").split(" | "))
-        if owner == LIBRARIES[library] and name in re.findall(r"`(\w+)`", names):
-            plain = re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", instead)
-            raise AttributeError(f"{owner}'s {name} is not a term here (docs/tasks/porting.md): {plain}", name=None)
-    hint = nearest(name, list(known), "docs/tasks/porting.md lists them")
-    words = f"no term has the name {name!r} in {LIBRARIES[library]}; {hint}"
+    owner, instead = ELSEWHERE.get(name, ("", ""))
+    if owner == library:
+        plain = re.sub(r"\[([^]]+)\]\([^)]+\)", r"\1", instead)
+        words = f"{LIBRARIES[owner]}'s {name} is not a term here (docs/tasks/porting.md): {plain}"
+    else:
+        hint = nearest(name, list(known), "docs/tasks/porting.md lists them")
+        words = f"no term has the name {name!r} in {LIBRARIES[library]}; {hint}"
     raise AttributeError(words, name=None)  # without a name Python adds no second hint

@@ -33,7 +33,7 @@ node_ends = st.none() | st.builds(
     NodeEnd, codes, st.just("why"), st.floats(0, 9), lost=st.booleans(), requested=st.booleans()
 )
 both = st.just([None] * NODES) | st.lists(node_ends, min_size=NODES, max_size=NODES)
-silence = st.builds(Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "deaf"]))
+silence = st.builds(Silence, st.floats(0, 60), st.just("12:00:00 UTC"), st.booleans(), st.sampled_from(["", "cut off"]))
 silences = st.just([None] * NODES) | st.lists(st.none() | silence, min_size=NODES, max_size=NODES)
 words = st.sampled_from(["", "words"])
 delays = st.builds(Delayed, words, st.booleans())

@@ -255,7 +255,7 @@ def test_counting_the_lines_of_a_log_takes_no_memory_of_its_size(tmp_path: Path)
 def test_one_look_passes_over_a_bounded_part_of_a_hole_and_the_next_one_goes_on(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(log_events, "_BARREN", 4 << 20)
+    monkeypatch.setattr(log_events, "_MOST_SKIPPED", 4 << 20)
     path = run.log("job", 1, 0)
     path.parent.mkdir(parents=True)
     first, last = lines_of(0, 1), lines_of(1, 1)
