@@ -52,7 +52,7 @@ def make_group(
     default: Callable[..., None] | None = None,
     cls: type[CommandGroup] = CommandGroup,
 ) -> typer.Typer:
-    """A group of commands. Without a subcommand it prints its help, or is the command ``default``, with the options of that."""
+    """A group of commands. Without a subcommand it runs ``default``, with the options of that, or prints its help where there is none."""
     group = typer.Typer(
         cls=cls,
         no_args_is_help=default is None,
