@@ -23,8 +23,10 @@ from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.metrics import warnings_of
 
 _POLL = 0.3
-_OF_LIBRARIES = re.compile(r'\{"|(?:DEBUG|INFO|WARNING|ERROR):[\w.]+:|\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d')
-"""Beginning of a line that a library logs: JSON, or Python's logging."""
+_OF_LIBRARIES = re.compile(
+    r'Warp CUDA warning|\{"|(?:DEBUG|INFO|WARNING|ERROR):[\w.]+:|\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d'
+)
+"""Beginning of a line that a library logs: a machine without GPUs, JSON, or Python's logging."""
 _PLAIN_INTERVAL = 2.0
 """Seconds between two plain lines of progress."""
 

@@ -37,9 +37,7 @@ def log_in(request: Request, form: Form = Depends(sent_form)) -> Response:
         token = access.sign_in(form.one("key").strip())
     except Refusal:
         wait = limit.refusal_of_failures(request.client.host if request.client else "unknown")
-        problem = (
-            wait or "this key is not known here; `muster keys list` shows the keys, `muster keys create NAME` makes one"
-        )
+        problem = wait or f"this key is unknown; {access.way_in()}"
         return render(request, "login.html", 429 if wait else 403, next=address, problem=problem)
     response = RedirectResponse(address, 303)
     secure = request.url.scheme == "https"

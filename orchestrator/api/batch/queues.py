@@ -35,7 +35,7 @@ def create_job_queue(context: Context, request: dict[str, Any]) -> dict[str, Any
     check_tags(request.get("tags") or {})
     context.actor.check(Operation.CREATE_JOB_QUEUE, Shared())
     if context.session.get(JobQueue, name):
-        raise ClientError(f"Job queue {name} exists already; change it with update-job-queue")
+        raise ClientError(f"Job queue {name} exists already; change it with: aws batch update-job-queue")
     if len(context.session.scalars(select(JobQueue.name)).all()) >= _MOST_QUEUES:
         raise ClientError(f"there are {_MOST_QUEUES} job queues; delete one first")
     _check_kind(request)

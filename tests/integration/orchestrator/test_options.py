@@ -65,7 +65,10 @@ def test_what_does_not_exist_is_refused_with_what_does_and_in_words_of_the_optio
         (("list", "--run", "nope"), "run nope does not exist"),
         (("queues", "create", "fine", "--like", "nope"), "Job queue nope does not exist; available: default"),
         (("queues", "create", "a b"), "NAME 'a b': up to 128 letters"),
-        (("queues", "create", "default"), "Job queue default exists already; change it with update-job-queue"),
+        (
+            ("queues", "create", "default"),
+            "Job queue default exists already; change it with: aws batch update-job-queue",
+        ),
         (("queues", "create", "fine", "--priority", "-1"), "--priority: "),
         (
             ("list", "--server", "127.0.0.1:8080"),

@@ -67,7 +67,7 @@ def test_the_servers_token_opens_a_session_that_ends_when_the_token_changes() ->
     assert Access(None, "a-token-of-the-server", console_secret=SECRET).session(session) == Actor("MUSTER_TOKEN")
     assert Access(None, "another-token-of-it", console_secret=SECRET).session(session) is None
     assert Access(None, None, console_secret=SECRET).session(session) is None
-    with pytest.raises(Refusal, match="not known here"):
+    with pytest.raises(Refusal, match="token is unknown"):
         Access(None, "a-token-of-the-server").sign_in("")
 
 
