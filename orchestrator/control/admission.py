@@ -125,7 +125,7 @@ class Admission:
         # a request may have ended the job since the snapshot was taken
         if job.status == Status.RUNNABLE and job.stop_reason is None:
             return self._attempts.begin(session, job, start)
-        self._work_queue.look_again([job.id])
+        self._work_queue.recheck([job.id])
         return None
 
     def reason(self, job: Job) -> Reason:

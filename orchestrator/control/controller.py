@@ -107,7 +107,7 @@ class Controller:
         """The thread that makes a pass now."""
         self._thread: threading.Thread | None = None
         bus.changed = engines.changed = changed
-        database.committed, database.changed = self._committed, self._look_again
+        database.committed, database.changed = self._committed, self._recheck
         isolation.before, self._loaded.reread = self.attempts.load_shared_rows, self.attempts.forget_states
         with database.session() as session:
             self.clock.restore(session)
@@ -171,14 +171,14 @@ class Controller:
                 self.work_queue.take_dependents(session)
         taken = self.work_queue.take_due(_SETTLED_A_TICK)
         due = [job_id for job_id in taken if not self._isolation.backoff.waits(("settle", job_id))]
-        self.work_queue.look_again(job_id for job_id in taken if self._isolation.backoff.waits(("settle", job_id)))
+        self.work_queue.recheck(job_id for job_id in taken if self._isolation.backoff.waits(("settle", job_id)))
         if due and len(taken) == _SETTLED_A_TICK:
             self.work_queue.alarm.set()  # the rest comes after the gangs that run
-        self.work_queue.look_again(self._isolation.jobs("settle", due, self._settle))
+        self.work_queue.recheck(self._isolation.jobs("settle", due, self._settle))
         if self._kept_version != self.work_queue.version:
             self._kept_version = self.work_queue.version
             self._loaded.keep(self.work_queue.active())
-        self.engines.look()
+        self.engines.poll()
         self._observe_gangs()
         why = self.bus.presence.cut_off
         if (why is not None) != self._is_cut_off:
@@ -236,16 +236,16 @@ class Controller:
             self.work_queue.note(jobs)
             self.logs.changed(job.id for job in jobs)
         else:
-            self._look_again([job.id for job in jobs])
+            self._recheck([job.id for job in jobs])
 
-    def _look_again(self, ids: Collection[str]) -> None:
+    def _recheck(self, ids: Collection[str]) -> None:
         """Try failed actions on these jobs at once, since requests have changed the jobs."""
         self._loaded.changed(ids)
         self.logs.changed(ids)
         for job_id in ids:
             for what in ("settle", "advance", "cancel", "preempt", "start"):
                 self._isolation.backoff.hurry((what, job_id))
-        self.work_queue.look_again(ids)
+        self.work_queue.recheck(ids)
 
     def _settle(self, session: Session, job: Job) -> None:
         self.work_queue.note([job])

@@ -108,7 +108,7 @@ class _Followed:
         for each in list(self.wakers):
             each.wake()
 
-    def look_soon(self) -> None:
+    def poll_soon(self) -> None:
         """Something has happened to the logs."""
         self.pause = min(self.pause, _LOOK)
 
@@ -178,7 +178,7 @@ class LogHub:
 
     def _pushed(self, node: Address, position: int, data: bytes) -> None:
         if (followed := self._followed.get(node[0])) is not None:
-            followed.look_soon()
+            followed.poll_soon()
             if followed.logs.push(node[1:], position, data):
                 followed.wake()
             else:  # something before it is missing
@@ -186,7 +186,7 @@ class LogHub:
 
     def _stated(self, node: Address, end: int | None, is_whole: bool) -> None:
         if (followed := self._followed.get(node[0])) is not None and followed.logs.state(node[1:], end, is_whole):
-            followed.look_soon()
+            followed.poll_soon()
             self._hurry_locked()
 
     # the hub's thread
@@ -226,17 +226,17 @@ class LogHub:
         for each in followed:
             each.logs.keep(min(MOST, share))
         now, due = machine.monotonic(), machine.monotonic() + _TICK
-        looking = [each for each in followed if not each.logs.is_over and not each.logs.delivers()]
+        polled_jobs = [each for each in followed if not each.logs.is_over and not each.logs.delivers()]
         for each in followed:
             if now >= each.next_ask and (attempt := each.logs.attempt) is not None:
                 self._ask(each, attempt, now)
-        for each in looking:
+        for each in polled_jobs:
             if each.is_polled:
                 continue
-            if now >= (next_look := each.polled + max(each.pause, _SHARE * len(looking))):
-                self._look(each)
+            if now >= (next_poll := each.polled + max(each.pause, _SHARE * len(polled_jobs))):
+                self._poll(each)
             else:
-                due = min(due, next_look)
+                due = min(due, next_poll)
         return max(0.0, due - now)
 
     def _read_rows(self, changed: Collection[_Followed]) -> None:
@@ -266,11 +266,11 @@ class LogHub:
         each.next_ask = now + each.asking
         self._bus.ask_for_logs(each.logs.job, attempt)
 
-    def _look(self, each: _Followed) -> None:
-        def look() -> None:
+    def _poll(self, each: _Followed) -> None:
+        def poll() -> None:
             pause = _AGAIN
             try:
-                is_new, now = each.logs.look(), machine.monotonic()
+                is_new, now = each.logs.poll(), machine.monotonic()
                 if is_new:
                     each.found = now
                     each.wake()
@@ -284,6 +284,6 @@ class LogHub:
 
         each.is_polled, each.pause = True, _LOOK_SELDOM
         try:
-            self._calls.submit(look)
+            self._calls.submit(poll)
         except StoreSilent:
             each.polled, each.pause, each.is_polled = machine.monotonic(), _AGAIN, False

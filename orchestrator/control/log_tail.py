@@ -133,7 +133,7 @@ class Tail:
 
 
 class JobLogs:
-    """The tails of one job's logs. Any thread may call; :meth:`look` reads the store."""
+    """The tails of one job's logs. Any thread may call; :meth:`poll` reads the store."""
 
     def __init__(self, run: Run, job: str) -> None:
         self.run, self.job = run, job
@@ -238,20 +238,20 @@ class JobLogs:
         """The tails of the open attempt."""
         return [tail for (attempt, _), tail in self._tails.items() if attempt == self.attempt]
 
-    def look(self) -> bool:
+    def poll(self) -> bool:
         """Read in the files what is missing in memory; whether something is new. Raises OSError."""
         with self._lock:
             is_first, former, attempt = not self._has_polled, set(self._former), self.attempt
         changed = is_first
         for number in sorted(former | (set() if attempt is None else {attempt})):
             for log, segments in logs_of(self.run, self.job, number).items():
-                changed = self._look_at(log, segments, is_first, number in former) or changed
+                changed = self._poll_log(log, segments, is_first, number in former) or changed
         with self._lock:
             self._former -= former
             self._has_polled = True
         return changed
 
-    def _look_at(self, log: Key, segments: Sequence[LogSegment], is_first: bool, is_last: bool) -> bool:
+    def _poll_log(self, log: Key, segments: Sequence[LogSegment], is_first: bool, is_last: bool) -> bool:
         with self._lock:
             tail = self._tails.setdefault(log, Tail(0))
             if not (is_first or is_last) and tail.delivers(machine.monotonic()) and not tail.has_gap:

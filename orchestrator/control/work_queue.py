@@ -55,7 +55,7 @@ class WorkQueue:
         in_parts = query.execution_options(yield_per=_LOADED_AT_ONCE)  # else all rows are in memory at once
         for jobs in session.scalars(in_parts).partitions():
             self.note(jobs)
-            self.look_again(job.id for job in jobs if job.status == Status.PENDING)
+            self.recheck(job.id for job in jobs if job.status == Status.PENDING)
             for job in jobs:
                 session.expunge(job)
 
@@ -94,7 +94,7 @@ class WorkQueue:
                 del self._due[job]
         return due
 
-    def look_again(self, jobs: Iterable[str]) -> None:
+    def recheck(self, jobs: Iterable[str]) -> None:
         """Return these at the next :meth:`take_due`, and at the next :meth:`take_active` where they have a gang."""
         with self._lock:
             for job in jobs:
@@ -133,7 +133,7 @@ class WorkQueue:
         try:
             for start in range(0, len(ended), _LOADED_AT_ONCE):
                 some = ended[start : start + _LOADED_AT_ONCE]
-                self.look_again(session.scalars(select(Dependency.job_id).where(Dependency.on_id.in_(some))))
+                self.recheck(session.scalars(select(Dependency.job_id).where(Dependency.on_id.in_(some))))
         except BaseException:
             with self._lock:
                 self._ended.update(dict.fromkeys(ended))

@@ -269,8 +269,10 @@ _EXPLAINED = (NodePhase.QUEUED, NodePhase.STARTING, NodePhase.UNREACHABLE)
 
 GangStatus = Sequence[NodeStatus]
 
-Look = GangStatus | BaseException
-"""A gang's status, or the error in its place where the engine can't look at that gang now."""
+StatusOrError = GangStatus | BaseException
+"""A gang's status, or the error in its place where the engine can't observe that gang now."""
+Look = StatusOrError
+"""Its earlier name, which engines outside Muster import."""
 
 
 @dataclass(frozen=True)
@@ -395,7 +397,7 @@ class Engine(Protocol):
         """
         ...
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         """The nodes, by index, of each of these gangs, in the order of ``handles``; in few requests, however many gangs there are.
 
         A gang that can't be looked at has its error in its place and hides no other one; an error that is raised is all gangs'. An

@@ -173,10 +173,10 @@ class EngineSet:
             return runner.observe(found)
         return [NodeStatus(NodePhase.UNREACHABLE, words=_not_served(found.engine))] * found.nodes
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Ask for newer statuses of the gangs that are observed; :attr:`changed` tells of those that differ. Does not wait."""
         for runner in self._runners.values():
-            runner.look()
+            runner.poll()
 
     def status_age(self, handle: str) -> float | None:
         """Seconds since the engine was asked for the status that :meth:`observe` returns; None where it does not answer now."""

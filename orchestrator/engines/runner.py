@@ -24,11 +24,11 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
-    Look,
     NodePhase,
     NodeStatus,
     NotYet,
     Plan,
+    StatusOrError,
     Transient,
 )
 from orchestrator.engines.toolkit.backoff import Backoff
@@ -38,12 +38,12 @@ log = logging.getLogger("muster.engines")
 
 OVERDUE = 10.0
 """Seconds after which an engine whose call has not returned counts as not answering."""
-_LAST_LOOK = 60.0
+_LAST_POLL = 60.0
 """Seconds that :meth:`Runner.stop` waits for the last status of a gang that was stopped."""
 _CLOSING = 5.0
 """Seconds that :meth:`Runner.close` gives the call that is being carried out."""
 
-_LOOKS = "looks"
+_POLLS = "polls"
 """Subject of a failure to poll all gangs."""
 _LOOKING, _SELDOM = 50.0, 2.0
 """Pause between two polls of all gangs, in multiples of the processor time of the first, so that they take 2 % of a core; and its
@@ -103,8 +103,8 @@ class Runner:
         self._refused: dict[str, NotYet] = {}
         """By gang: what its last launch has to wait for."""
         self._observed: dict[Handle, _Observed] = {}
-        self._is_looking = False
-        self._next_look = 0.0
+        self._is_polling = False
+        self._next_poll = 0.0
         """When the next poll of all gangs is due (monotonic [s])."""
         self._reporting: Future[Capacity] | None = None
         self._capacity: Capacity | None = None
@@ -159,8 +159,8 @@ class Runner:
         problem = self._any_silence or self._backoff.failure("hosts") or self.unknown
         pauses = self._backoff.pauses()
         gangs = {subject[1]: pause for subject, pause in pauses.items() if isinstance(subject, tuple)}
-        if _LOOKS in pauses:
-            gangs |= dict.fromkeys(self._observed, pauses[_LOOKS])
+        if _POLLS in pauses:
+            gangs |= dict.fromkeys(self._observed, pauses[_POLLS])
         return Health(self._reported_at, problem, len(gangs), min(gangs.values(), default=None))
 
     # -- what the controller asks -------------------------------------------------------------------------------------
@@ -225,14 +225,14 @@ class Runner:
         return inf if launch is not None and not launch.done() else self._backoff.pause(("launch", gang))
 
     def observe(self, handle: Handle) -> GangStatus | None:
-        """The newest status of a gang, of which :meth:`look` asks for newer ones from now on; None before the first.
+        """The newest status of a gang, of which :meth:`poll` asks for newer ones from now on; None before the first.
 
         Nodes that were seen running, or not yet at all, are unreachable where there is no newer status, and say why.
         """
         if (known := self._observed.get(handle)) is None:
             with self._lock:
                 known = self._observed[handle] = _Observed()
-            self._submit(self._look_at_new)
+            self._submit(self._poll_new)
         status = known.status
         if trouble := self._trouble(handle):
             unknown = NodeStatus(NodePhase.UNREACHABLE, words=trouble)
@@ -240,7 +240,7 @@ class Runner:
             return [replace(each, phase=unknown.phase, words=trouble) if each.running else each for each in nodes]
         return status
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """Ask for newer statuses of all gangs that are observed, unless that is under way.
 
         Reports, too, that the engine has begun or ceased to be silent: its gangs look different then.
@@ -249,10 +249,10 @@ class Runner:
             self._was_silent = not self._was_silent
             for gang in {*self._launches, *(handle.gang for handle in self._observed)}:
                 self._changed(gang)
-        is_due = machine.monotonic() >= self._next_look and not self._backoff.waits(_LOOKS)
-        if self._observed and is_due and not self._is_looking:
-            self._is_looking = True
-            self._submit(self._look_at_all)
+        is_due = machine.monotonic() >= self._next_poll and not self._backoff.waits(_POLLS)
+        if self._observed and is_due and not self._is_polling:
+            self._is_polling = True
+            self._submit(self._poll_all)
 
     def status_age(self, handle: Handle) -> float | None:
         """Seconds since the engine was asked for the newest status of the gang; None where it does not answer now."""
@@ -263,14 +263,14 @@ class Runner:
 
     def _trouble(self, handle: Handle) -> str | None:
         """Why there is no newer status of a gang."""
-        return self.silence or self._backoff.failure(_LOOKS) or self._backoff.failure(("look", handle))
+        return self.silence or self._backoff.failure(_POLLS) or self._backoff.failure(("poll", handle))
 
     def stop(self, handle: Handle, grace: float) -> GangStatus:
         """Stop the gang on the caller's thread, which may take long; returns its last status. Raises EngineError."""
         self._call("stop the gang", lambda: self.engine.stop(handle, grace))
-        looking = self._submit(lambda: self._call("look at the gang", lambda: status_of(self.engine, handle)))
+        observing = self._submit(lambda: self._call("look at the gang", lambda: status_of(self.engine, handle)))
         try:
-            return machine.result(looking, _LAST_LOOK)
+            return machine.result(observing, _LAST_POLL)
         except TimeoutError:
             raise Transient(
                 self.silence or f"the {self.engine.name} engine has not reported how the gang ended"
@@ -284,7 +284,7 @@ class Runner:
             if handle is not None:
                 self._observed.pop(handle, None)
         self._backoff.worked(("launch", gang))
-        self._backoff.worked(("look", handle))
+        self._backoff.worked(("poll", handle))
 
     # -- on the engine's threads --------------------------------------------------------------------------------------
 
@@ -354,58 +354,60 @@ class Runner:
         self._backoff.worked(subject)
         return handle
 
-    def _look_at_new(self) -> None:
+    def _poll_new(self) -> None:
         """The first poll of all gangs that were not polled yet."""
         with self._lock:
             new = {handle: known for handle, known in self._observed.items() if known.is_new}
             for known in new.values():
                 known.is_new = False
         if new:
-            self._look(list(new))
+            self._poll(list(new))
 
-    def _look_at_all(self) -> None:
+    def _poll_all(self) -> None:
         """One poll of all gangs. The more processor time it takes, the longer the pause until the next one."""
         began = machine.processor_time()
         try:
-            self._look([handle for handle in list(self._observed) if not self._backoff.waits(("look", handle))])
+            self._poll([handle for handle in list(self._observed) if not self._backoff.waits(("poll", handle))])
         finally:
             pause = min(_LOOKING * (machine.processor_time() - began), _SELDOM)
-            self._next_look, self._is_looking = machine.monotonic() + pause, False
+            self._next_poll, self._is_polling = machine.monotonic() + pause, False
 
-    def _look(self, handles: Sequence[Handle]) -> None:
-        before = self._backoff.failure(_LOOKS)
+    def _poll(self, handles: Sequence[Handle]) -> None:
+        before = self._backoff.failure(_POLLS)
         requested_at = machine.monotonic()
-        looks: Sequence[Look] = ()
+        statuses: Sequence[StatusOrError] = ()
         try:
-            looks = self._call("look at its gangs", lambda: self._statuses(handles))
+            statuses = self._call("look at its gangs", lambda: self._statuses(handles))
         except EngineError as error:
-            self._failed(_LOOKS, error)
+            self._failed(_POLLS, error)
         else:
-            self._backoff.worked(_LOOKS)
+            self._backoff.worked(_POLLS)
         changed = [
-            handle for handle, look in zip(handles, looks, strict=False) if self._note(handle, look, requested_at)
+            handle
+            for handle, status in zip(handles, statuses, strict=False)
+            if self._note(handle, status, requested_at)
         ]
-        for handle in changed if before == self._backoff.failure(_LOOKS) else list(self._observed):
+        for handle in changed if before == self._backoff.failure(_POLLS) else list(self._observed):
             self._changed(handle.gang)
 
-    def _statuses(self, handles: Sequence[Handle]) -> Sequence[Look]:
-        looks = self.engine.observe(handles)
-        if len(looks) != len(handles):
-            raise ValueError(f"{len(looks)} statuses of {len(handles)} gangs")
-        return looks
+    def _statuses(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
+        statuses = self.engine.observe(handles)
+        if len(statuses) != len(handles):
+            raise ValueError(f"{len(statuses)} statuses of {len(handles)} gangs")
+        return statuses
 
-    def _note(self, handle: Handle, look: Look, requested_at: float) -> bool:
+    def _note(self, handle: Handle, status: StatusOrError, requested_at: float) -> bool:
         """Keep a status; returns whether it differs from the one before."""
-        subject = ("look", handle)
+        subject = ("poll", handle)
         with self._lock:
             if (known := self._observed.get(handle)) is None:
                 return False  # it was forgotten meanwhile
-            if not isinstance(look, BaseException):
-                before, known.status, known.requested_at = known.status, look, requested_at
-                return self._backoff.worked(subject) or before != look
+            if not isinstance(status, BaseException):
+                before, known.status, known.requested_at = known.status, status, requested_at
+                return self._backoff.worked(subject) or before != status
 
         def fail() -> None:
-            raise look
+            raise status
 
         try:
             self._call("look at the gang", fail)

@@ -397,7 +397,7 @@ def _forget(session: Session) -> None:
 
 
 @event.listens_for(_Session, "do_orm_execute")
-def _look_up_nodes(state: ORMExecuteState) -> None:
+def _load_nodes(state: ORMExecuteState) -> None:
     """SQLite reads the whole table of nodes to find those of several attempts, by pairs of keys; by the jobs it uses the index."""
     is_of_nodes = state.is_relationship_load and state.bind_mapper is inspect(Node)
     pairs = state.parameters.get("primary_keys") if is_of_nodes and isinstance(state.parameters, dict) else None

@@ -104,16 +104,16 @@ class AutomaticEvaluations:
         self._on_store("unclaimed checkpoints", self._let_go)
         while not self._ending.wait(self._interval):
             if self._controller.trouble is None and self._controller.access.problem() is None:
-                self.look()
+                self.poll()
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """One look at the evaluations that are open and at all trainings that run; one that can't be handled does not stop the others."""
         self._backoff.tidy()
         self._isolated("open evaluations", self._close_ended)
         active = self._controller.work_queue.active()
         self._known = {job: self._known[job] for job in active if job in self._known}
         for job in active:
-            self._on_store(f"job {job}", partial(self._look_at, job))
+            self._on_store(f"job {job}", partial(self._check, job))
 
     def _on_store(self, subject: str, body: Callable[[], None]) -> None:
         """Carry out ``body``, which may hang; while it does, the subject is passed over, so that nothing is done twice."""
@@ -173,7 +173,7 @@ class AutomaticEvaluations:
 
     # -- what is due ----------------------------------------------------------------------------------------------------
 
-    def _look_at(self, job_id: str) -> None:
+    def _check(self, job_id: str) -> None:
         training = self._training(job_id)
         if training is None:
             return

@@ -81,8 +81,8 @@ def next_part(controller: Controller, actor: Actor, after: str, older_than: str,
     while True:
         rules = controller.retention.rules()
         rules = rules if older is None else replace(rules, default=older)
-        looks, following = controller.retention.step(place, rules, take=take, by=by)
-        found += looks
+        steps, following = controller.retention.step(place, rules, take=take, by=by)
+        found += steps
         if following is None or time.monotonic() > deadline:
             return {"runs": found, "next": None if following is None else str(following)}
         place = following

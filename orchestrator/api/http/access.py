@@ -45,14 +45,14 @@ class Access:
         return self.keys.current() if self.keys else {}
 
     def is_new(self, access_key_id: str) -> bool:
-        """Whether another process may just have made the key of this id: then :meth:`look_again` before it is refused."""
+        """Whether another process may just have made the key of this id: then :meth:`reload` before it is refused."""
         return (
             self.keys is not None
             and access_key_id not in self.known()
             and bool(re.fullmatch(ACCESS_KEY_ID, access_key_id))
         )
 
-    def look_again(self) -> None:
+    def reload(self) -> None:
         """Read the keys of the database; the caller's thread may wait for it."""
         if self.keys:
             self.keys.refresh()
@@ -86,7 +86,7 @@ class Access:
     def sign_in(self, credential: str) -> str:
         """Open a session for the server's token or a key; its text reveals nothing of the secret. Raises Refusal."""
         if self.is_new(credential.partition(":")[0]):
-            self.look_again()
+            self.reload()
         name, _ = self._proven(credential)
         claim = f"{name}.{int(time.time()) + SESSION}.{secrets.token_urlsafe(16)}"
         return f"{claim}.{self._seal(name, claim)}"

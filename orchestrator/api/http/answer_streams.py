@@ -31,7 +31,7 @@ _SHARE = 0.001
 
 _open: Counter[str] = Counter()
 """Number of open answers by the name of their reader; used by the event loop alone."""
-_looks = machine.pool("followers", _THREADS)
+_reads = machine.pool("followers", _THREADS)
 """Each open answer that needs no store has one call here at most."""
 
 
@@ -61,18 +61,18 @@ def pause(least: float) -> float:
     return max(least, _SHARE * _open.total())
 
 
-async def polled(look: Callable[[], T], calls: StoreCalls | None) -> T:
+async def polled(read: Callable[[], T], calls: StoreCalls | None) -> T:
     """The result of ``look``, from a thread that serves these answers alone; one of ``calls`` where it reads the store.
 
     Raises what it raises, StoreSilent.
     """
-    future = calls.submit(look) if calls else _looks.submit(partial(contextvars.copy_context().run, look))
+    future = calls.submit(read) if calls else _reads.submit(partial(contextvars.copy_context().run, read))
     return await asyncio.wrap_future(future)
 
 
-async def polled_patiently(look: Callable[[], T], calls: StoreCalls | None, seconds: float) -> AsyncIterator[T | None]:
-    """:func:`looked`, and before it None whenever so many seconds have passed: the store may hang."""
-    task = asyncio.ensure_future(polled(look, calls))
+async def polled_patiently(read: Callable[[], T], calls: StoreCalls | None, seconds: float) -> AsyncIterator[T | None]:
+    """:func:`polled`, and before it None whenever so many seconds have passed: the store may hang."""
+    task = asyncio.ensure_future(polled(read, calls))
     try:
         while not (await asyncio.wait({task}, timeout=seconds))[0]:
             yield None

@@ -144,11 +144,11 @@ class Guard:
     async def _authenticate(self, head: RequestHead, body: RequestBody) -> Actor:
         scheme, _, credentials = (head.single("authorization") or "").strip().partition(" ")
         if scheme.lower() == "bearer":
-            await self._look_for(credentials.strip().partition(":")[0], head.client)
+            await self._find_key(credentials.strip().partition(":")[0], head.client)
             return self.access.bearer(credentials.strip())
         if scheme == ALGORITHM:
             signed = Signed.parse(credentials)
-            await self._look_for(signed.access_key_id, head.client)
+            await self._find_key(signed.access_key_id, head.client)
             key = self.access.known().get(signed.access_key_id)
             if key is None:
                 raise Refusal(
@@ -165,13 +165,13 @@ class Guard:
             f"'Authorization: Bearer …', or sign with AWS Signature Version 4; {self.access.way_in()}",
         )
 
-    async def _look_for(self, access_key_id: str, client: str) -> None:
+    async def _find_key(self, access_key_id: str, client: str) -> None:
         """See a key that another process has just created; the loop does not wait for the database meanwhile.
 
         An address that has sent too many wrong keys causes no more reads.
         """
         if self.access.is_new(access_key_id) and not self.limit.fails_too_often(client):
-            await asyncio.to_thread(self.access.look_again)
+            await asyncio.to_thread(self.access.reload)
 
 
 def session_of(headers: Mapping[str, str], port: int | None) -> str:

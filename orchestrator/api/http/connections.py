@@ -146,7 +146,7 @@ class Connection(H11Protocol):
             return
         if not is_local:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, _UNSENT)
-        self._look()
+        self._poll()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._set_deadline(None)
@@ -159,11 +159,11 @@ class Connection(H11Protocol):
         for start in range(0, len(data), _PIECE):
             if not self.transport.is_closing():
                 super().data_received(data[start : start + _PIECE])
-        self._look()
+        self._poll()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
-        self._look()
+        self._poll()
 
     def pause_writing(self) -> None:
         """The client has stopped reading its answer, such as a pager at rest: it may stay for a minute, or until others need the place."""
@@ -195,7 +195,7 @@ class Connection(H11Protocol):
         self._set_deadline(None)
         self.transport.abort()
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         """Which phase the connection is in; a deadline runs from the beginning of a phase, whatever trickles in."""
         if self.transport.is_closing():
             return

@@ -73,7 +73,7 @@ class LogFile:
         self._started, self._skipped = 0, 0
         self._forget()
 
-    def look(self) -> LogSnapshot:
+    def snapshot(self) -> LogSnapshot:
         """A view of the log as it is now: whole lines only. A log that does not exist yet is empty. Raises OSError.
 
         A look skips at most 64 MiB that hold no events; the next look continues there.

@@ -124,7 +124,7 @@ def get_log_events(controller: Controller, actor: Actor, request: dict[str, Any]
     with controller.database.session() as session:
         group = groups.named_by(session, request)
         stream = _named(controller, actor, session, group, request["logStreamName"], Operation.GET_LOG_EVENTS)
-    view = stream.file.look()
+    view = stream.file.snapshot()
     since, before = request.get("startTime", 0), request.get("endTime")
     limit = request.get("limit", _MOST_EVENTS)
     token = _STREAM_TOKEN.fullmatch(sent) if (sent := request.get("nextToken")) else None
@@ -163,7 +163,7 @@ def filter_log_events(controller: Controller, actor: Actor, request: dict[str, A
     if len(request.get("logStreamNames", ())) != 1 and any(stream.live for stream in streams):
         before = min(before, newest)
     reached = (int(token[2]), int(token[3]), int(token[4])) if token else None
-    views = [stream.file.look() for stream in streams]
+    views = [stream.file.snapshot() for stream in streams]
     events: Iterator[LogEvent]
     if ascending:
         start = max(since, reached[0]) if reached else since

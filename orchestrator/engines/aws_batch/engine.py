@@ -20,7 +20,7 @@ from botocore.config import Config
 
 from orchestrator.domain.hosts import Limit, Queued
 from orchestrator.domain.resources import Resources
-from orchestrator.engines.api import EngineError, Gang, Handle, Look, NotYet, Plan, node_plans
+from orchestrator.engines.api import EngineError, Gang, Handle, NotYet, Plan, StatusOrError, node_plans
 from orchestrator.engines.aws_batch import TRAITS
 from orchestrator.engines.aws_batch.config import is_mounted_from, load_config
 from orchestrator.engines.aws_batch.errors import FAILURES, answered, session_for, words_of
@@ -111,11 +111,11 @@ class AwsBatchEngine:
         facts = {"main": gang.main, "aws": job, "queue": queue, "supervised": list(requests.supervised)}
         return Handle(self.name, gang.name, len(plan.nodes), {**store_facts(gang), **facts})
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         """AWS is asked for up to 100 jobs and nodes in a request, and for no gang twice within the interval of the configuration."""
         watched = [self._watched(handle) for handle in handles]
         self._update([each for each in watched if each.is_due])
-        return [each.look for each in watched]
+        return [each.observed for each in watched]
 
     def stop(self, handle: Handle, grace: float) -> None:
         """AWS's own grace is 30 s, whatever ``grace`` says."""
@@ -132,9 +132,9 @@ class AwsBatchEngine:
             except EngineError as error:
                 problem = error
             self._update([watched])
-            if isinstance(watched.look, BaseException):
-                raise watched.look
-            running = sum(node.running for node in watched.look)
+            if isinstance(watched.observed, BaseException):
+                raise watched.observed
+            running = sum(node.running for node in watched.observed)
             if problem is not None and running:  # else AWS has forgotten the job
                 raise problem
             words = f"{counted(running, 'node')} of job {handle.facts['aws']} running"

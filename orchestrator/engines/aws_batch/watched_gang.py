@@ -9,7 +9,7 @@ from typing import Any
 
 from orchestrator.domain.gang import LOG_GROUP
 from orchestrator.domain.job import AWS_NOT_STARTED, TERMINAL
-from orchestrator.engines.api import Cause, GangStatus, Handle, Look, NodePhase, NodeStatus
+from orchestrator.engines.api import Cause, GangStatus, Handle, NodePhase, NodeStatus, StatusOrError
 from orchestrator.engines.aws_batch.logs import CopiedLog, GangLogs
 from orchestrator.engines.toolkit.outcomes import record, recorded, seen
 from orchestrator.engines.toolkit.statuses import ended, one_by_one
@@ -35,7 +35,7 @@ class WatchedGang:
         """AWS's ids of the job and of each of its nodes."""
         self.next = 0.0
         """When AWS is asked again (monotonic [s])."""
-        self.look: Look = ()
+        self.observed: StatusOrError = ()
         """The last status, empty before the first; or the error in its place."""
         self.trouble = ""
         """Why AWS could not be asked the last time."""
@@ -49,9 +49,9 @@ class WatchedGang:
     @property
     def is_due(self) -> bool:
         """Whether AWS is to be asked now: a gang of which nothing runs does not change any more."""
-        if isinstance(self.look, BaseException) or not self.look:
+        if isinstance(self.observed, BaseException) or not self.observed:
             return True
-        return time.monotonic() >= self.next and any(node.running for node in self.look)
+        return time.monotonic() >= self.next and any(node.running for node in self.observed)
 
     def update(self, described: Mapping[str, Mapping[str, Any]], trouble: str, pause: float) -> None:
         """Take what AWS has described, by id.
@@ -64,10 +64,10 @@ class WatchedGang:
         self.trouble, self.next = trouble, time.monotonic() + pause
         if trouble:
             unknown = [NodeStatus(NodePhase.UNREACHABLE, words=trouble)] * self.handle.nodes
-            known = unknown if isinstance(self.look, BaseException) else self.look or unknown
-            self.look = [dataclasses.replace(node, stale=trouble) if node.running else node for node in known]
+            known = unknown if isinstance(self.observed, BaseException) else self.observed or unknown
+            self.observed = [dataclasses.replace(node, stale=trouble) if node.running else node for node in known]
         else:
-            [self.look] = one_by_one(lambda _: self._status(described), [self.handle])
+            [self.observed] = one_by_one(lambda _: self._status(described), [self.handle])
 
     def _status(self, described: Mapping[str, Mapping[str, Any]]) -> GangStatus:
         job, *nodes = [described.get(name) for name in self.ids]

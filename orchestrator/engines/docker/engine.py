@@ -38,11 +38,11 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
-    Look,
     NodePhase,
     NodeStatus,
     NotYet,
     Plan,
+    StatusOrError,
     node_plans,
 )
 from orchestrator.engines.docker import TRAITS
@@ -130,7 +130,7 @@ class DockerEngine:
         with answered():
             return self._launch(plan)
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         """In one request for all gangs, and one more for each container that has ended or whose log is not copied yet.
 
         While Docker Engine does not answer, the nodes count as running.

@@ -27,11 +27,11 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
-    Look,
     NodePhase,
     NodePlan,
     NodeStatus,
     Plan,
+    StatusOrError,
     Transient,
     node_plans,
     unused_user,
@@ -165,7 +165,7 @@ class LocalEngine:
             raise
         return Handle(self.name, gang.name, len(nodes), {"nodes": [nodes[index] for index in range(len(nodes))]})
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         return one_by_one(self._observe, handles)
 
     def _observe(self, handle: Handle) -> GangStatus:

@@ -30,12 +30,12 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
-    Look,
     NodePhase,
     NodePlan,
     NodeStatus,
     NotYet,
     Plan,
+    StatusOrError,
     node_plans,
 )
 from orchestrator.engines.ray import TRAITS
@@ -168,7 +168,7 @@ class RayEngine:
         self._note(handle)
         return handle
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         return one_by_one(self._observe, handles)
 
     def _observe(self, handle: Handle) -> GangStatus:

@@ -31,11 +31,11 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
-    Look,
     NodePhase,
     NodeStatus,
     NotYet,
     Plan,
+    StatusOrError,
     node_plans,
 )
 from orchestrator.engines.slurm import TRAITS
@@ -139,7 +139,7 @@ class SlurmEngine:
             raise NotYet(f"Slurm: {error}", unknown=True) from error
         return Handle(self.name, gang.name, len(plan.nodes), {**facts, "slurm": number})
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         return one_by_one(self._observe, handles)
 
     def _observe(self, handle: Handle) -> GangStatus:

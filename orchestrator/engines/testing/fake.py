@@ -12,10 +12,10 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
-    Look,
     NodePhase,
     NodeStatus,
     Plan,
+    StatusOrError,
     Traits,
     node_plans,
 )
@@ -60,7 +60,7 @@ class FakeEngine:
         """Names of the threads on which it was called for its hosts, launches and looks."""
         self.closed = 0
         """Number of times that it was closed."""
-        self.looks = 0
+        self.polls = 0
         """Number of times that it was asked for statuses."""
 
     def capacity(self) -> Capacity:
@@ -79,9 +79,9 @@ class FakeEngine:
             self.cluster.gangs[name] = nodes
         return Handle(self.name, name, len(plan.nodes), {})
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         self._called()
-        self.looks += 1
+        self.polls += 1
         return one_by_one(self._observe, handles)
 
     def _observe(self, handle: Handle) -> GangStatus:

@@ -7,7 +7,7 @@ from functools import partial
 from inspect import signature
 from typing import Any
 
-from orchestrator.engines.api import Cause, Engine, GangStatus, Handle, Look, NodePhase, NodeStatus
+from orchestrator.engines.api import Cause, Engine, GangStatus, Handle, NodePhase, NodeStatus, StatusOrError
 
 
 def ended(address: str, exit_code: int | None, words: str = "", gpus: tuple[str, ...] = ()) -> NodeStatus:
@@ -16,12 +16,12 @@ def ended(address: str, exit_code: int | None, words: str = "", gpus: tuple[str,
     return NodeStatus(NodePhase.ENDED, address, words, cause, exit_code, gpus)
 
 
-def one_by_one(look: Callable[[Handle], GangStatus], handles: Sequence[Handle]) -> list[Look]:
-    """:meth:`Engine.observe` of an engine that observes one gang at a time with ``look``."""
-    statuses: list[Look] = []
+def one_by_one(observe: Callable[[Handle], GangStatus], handles: Sequence[Handle]) -> list[StatusOrError]:
+    """:meth:`Engine.observe` of an engine that observes one gang at a time with ``observe``."""
+    statuses: list[StatusOrError] = []
     for handle in handles:
         try:
-            statuses.append(look(handle))
+            statuses.append(observe(handle))
         except (Exception, SystemExit) as error:  # the runner tells a failure that may pass from a bug, and reports it
             statuses.append(error)
     return statuses
@@ -37,7 +37,7 @@ def observing_several(engine: Engine) -> Engine:
 
 def status_of(engine: Engine, handle: Handle) -> GangStatus:
     """The status of one gang. Raises the error that the engine has in its place."""
-    [look] = engine.observe([handle])
-    if isinstance(look, BaseException):
-        raise look
-    return look
+    [status] = engine.observe([handle])
+    if isinstance(status, BaseException):
+        raise status
+    return status

@@ -131,14 +131,14 @@ def test_a_gang_that_slurm_has_forgotten_is_not_started_again_and_has_ended(benc
     handle = bench.launch(bench.gang("exit 0"))
     bench.ended(handle)
     facts = {**handle.facts, "slurm": "999999"}
-    assert [node.exit_code for node in look(Handle("slurm", "forgotten/1/1", 1, facts))] == [0]
+    assert [node.exit_code for node in poll(Handle("slurm", "forgotten/1/1", 1, facts))] == [0]
     forgotten = Handle("slurm", "forgotten/1/1", 1, {**facts, "job": "another"})
-    [node] = look(forgotten)
+    [node] = poll(forgotten)
     assert (node.running, node.words) == (False, "Slurm has forgotten the job, and the node left no outcome")
     bench.engine.stop(forgotten, 1.0)
 
 
-def look(handle: Handle) -> list[NodeStatus]:
+def poll(handle: Handle) -> list[NodeStatus]:
     """The status that a new engine, without a memory, gets from Slurm."""
     engine = SlurmEngine()
     return wait_for(

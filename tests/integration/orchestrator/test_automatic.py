@@ -43,7 +43,7 @@ class Controller:
         self.server.evaluations._interval = 3600
         self.server.start()
         self.client = Client(self.server.url)
-        self.look: Callable[[], None] = self.server.evaluations.look
+        self.poll: Callable[[], None] = self.server.evaluations.poll
 
     def stop(self) -> None:
         self.client.close()
@@ -102,25 +102,25 @@ def test_checkpoints_are_evaluated_in_jobs_one_at_a_time_and_the_newest_when_the
 ) -> None:
     training = controller.train({"every": 2, "episodes": 8})
     controller.save(10)
-    controller.look()
+    controller.poll()
     assert controller.evaluations() == []
     add_checkpoint(controller.server.store, "taught", 12, scheduled=False)  # of a long iteration: it is not counted
-    controller.look()
+    controller.poll()
     assert controller.evaluations() == []
     controller.save(20)
-    controller.look()
-    controller.look()
+    controller.poll()
+    controller.poll()
     assert controller.evaluations() == [(20, "RUNNABLE")]
     controller.save(30, 40)
-    controller.look()
+    controller.poll()
     controller.save(50, 60, 70)
-    controller.look()
+    controller.poll()
     assert controller.evaluations() == [(20, "RUNNABLE")], "one at a time"
     run = controller.server.store.run("taught")
     assert [each.iteration for each in list_checkpoints(run)] == [20, 60, 70], "what waits is not pruned"
     with caplog.at_level(logging.WARNING):
         controller.end(controller.newest()["job"])
-        controller.look()
+        controller.poll()
     assert controller.evaluations() == [(20, "FAILED"), (70, "RUNNABLE")]
     assert "run taught: the evaluation of checkpoint 00000020-e1 failed: the test says so" in caplog.text
     assert controller.newest()["passed"] == 1, "40, or 60"
@@ -139,14 +139,14 @@ def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate(
 ) -> None:
     training = controller.train({"every": 1})
     controller.save(10)
-    controller.look()
+    controller.poll()
     listed = controller.muster("list").stdout.splitlines()
     assert [line.split()[0] for line in listed[1:-1]] == [training[:8]]
     assert listed[-1] == "1 automatic evaluation is not shown; --all shows it"
     first = controller.newest()["job"]
     controller.end(first)
     controller.save(20)
-    controller.look()
+    controller.poll()
     output = controller.muster("list").stdout
     assert output.endswith("2 automatic evaluations are not shown; --all shows them\n")
     every = controller.muster("list", "--all").stdout
@@ -161,16 +161,16 @@ def test_a_list_counts_automatic_evaluations_and_names_what_they_evaluate(
 def test_facts_of_a_deleted_run_are_not_shown_for_a_new_run_of_the_same_name(controller: Controller) -> None:
     former = controller.train({"every": 1})
     controller.save(10)
-    controller.look()
+    controller.poll()
     evaluation = controller.newest()["job"]
     controller.end(evaluation)
     controller.end(former)
-    controller.look()
+    controller.poll()
     shutil.rmtree(controller.server.store.run("taught").path)
     training = controller.train({"every": 1})
     found = controller.client.get("/api/runs/taught")
     assert found["automatic"] is None and [job["id"] for job in found["jobs"]] == [training]
-    controller.look()
+    controller.poll()
     assert controller.newest()["job"] is None and controller.newest()["checkpoint"] is None
     old = controller.client.get(f"/api/jobs/{former}")
     assert old["runIsReplaced"] and old["results"] is None and old["progress"] is None
@@ -193,19 +193,19 @@ def test_a_stopped_controller_neither_loses_nor_repeats_evaluations(
         with monkeypatch.context() as patch:  # before the transaction, at its end, and in the middle of the submission
             patch.setattr(module, name, killed)
             with pytest.raises(Killed):
-                controller.look()
+                controller.poll()
         controller.stop()
         controller.start()
         assert controller.evaluations() == []
-    controller.look()
+    controller.poll()
     assert controller.evaluations() == [(10, "RUNNABLE")]
     controller.end(controller.newest()["job"])
-    controller.look()
+    controller.poll()
     run = controller.server.store.run("taught")
     keep_for_evaluation(run, "00000010-e1")  # as one that was killed before it submitted a job
     controller.stop()
     controller.start()
-    controller.look()
+    controller.poll()
     assert controller.evaluations() == [(10, "FAILED")]
     wait_for(lambda: pending_checkpoints(run) == set(), what="the claim is given up")
 
@@ -213,13 +213,13 @@ def test_a_stopped_controller_neither_loses_nor_repeats_evaluations(
 def test_a_training_that_is_asked_to_stop_or_has_saved_its_last_checkpoint_gets_no_more(controller: Controller) -> None:
     training = controller.train({"every": 1})
     controller.save(90, 100)
-    controller.look()
+    controller.poll()
     assert controller.evaluations() == [], "the training itself evaluates its last one"
     with controller.server.controller.database.session() as session:
         session.get_one(Job, training).stop_reason = "enough"
         session.commit()
         controller.save(95)
-        controller.look()
+        controller.poll()
     assert controller.evaluations() == []
 
 
@@ -231,18 +231,18 @@ def test_an_evaluation_that_its_queue_refuses_is_reported(
     controller.train({"every": 1, "queue": "idle"})
     controller.client.batch("UpdateJobQueue", jobQueue="idle", state="DISABLED")
     controller.save(10)
-    controller.look()
-    controller.look()
+    controller.poll()
+    controller.poll()
     problem = "checkpoint 00000010-e1 was not evaluated: Job queue idle is DISABLED and takes no jobs"
     assert controller.newest()["problem"] == problem and controller.evaluations() == []
     controller.save(20)
-    controller.look()
+    controller.poll()
     assert "checkpoint 00000020-e1" in controller.newest()["problem"]
     refused = "run taught: checkpoints are not evaluated: Job queue idle is DISABLED and takes no jobs"
     assert caplog.messages.count(refused) == 1, "once, however many checkpoints it concerns"
     controller.client.batch("UpdateJobQueue", jobQueue="idle", state="ENABLED")
     controller.save(30)
-    controller.look()
+    controller.poll()
     assert controller.evaluations() == [(30, "RUNNABLE")] and controller.newest()["problem"] is None
 
 

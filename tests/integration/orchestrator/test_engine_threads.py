@@ -78,7 +78,7 @@ def launched(several: EngineSet, what: Gang) -> str:
 
 def observed(several: EngineSet, handle: str) -> GangStatus | None:
     """The newest status, after a request for a newer one, as in a pass of the controller."""
-    several.look()
+    several.poll()
     return several.observe(handle)
 
 

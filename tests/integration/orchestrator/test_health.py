@@ -20,10 +20,10 @@ from tests.support.orchestrator.jobs import await_status
 
 
 def test_a_loop_that_is_stuck_makes_the_health_check_fail(inside: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    gate, look = threading.Event(), inside.controller.engines.look
+    gate, poll = threading.Event(), inside.controller.engines.poll
     health = lambda: httpx.get(f"{inside.url}/healthz", timeout=30)  # noqa: E731
     assert health().status_code == 200
-    monkeypatch.setattr(inside.controller.engines, "look", lambda: (gate.wait(120), look()))
+    monkeypatch.setattr(inside.controller.engines, "poll", lambda: (gate.wait(120), poll()))
     try:
         wait_for(lambda: health().status_code == 503, 60, "that the loop is stuck")
         assert "the controller's loop has made no progress for" in health().json()["message"]

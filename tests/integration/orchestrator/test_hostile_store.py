@@ -254,7 +254,7 @@ def test_logs_and_outcomes_are_neither_read_nor_written_through_a_link(tmp_path:
     before = {path: path.read_bytes() for path in other.rglob("*") if path.is_file()}
     (run.path / place).parent.mkdir(parents=True)
     (run.path / place).symlink_to(other)
-    assert not list(LogView.of(run, "job").drain()) and not log_file(run.log("job", 1, 0), "s").look().segments
+    assert not list(LogView.of(run, "job").drain()) and not log_file(run.log("job", 1, 0), "s").snapshot().segments
     assert read_outcome(run, "job", 1, 0) is None
     kind = place.partition("/")[0]
     with pytest.raises(DamagedFile, match=f"{place}: a link"):

@@ -86,15 +86,15 @@ def test_lines_come_by_push_alone_while_the_bus_delivers(talk: Talk, monkeypatch
     everyone = [talk.follow() for _ in range(5)]
     talk.say("first")
     wait_for(lambda: all(map(talk.has_all, everyone)) and talk.is_pushed())
-    looks: list[Any] = []
+    polls: list[Any] = []
     genuine: Callable[..., Any] = log_tail.read_log
     for module in (log_tail, log_files):
-        monkeypatch.setattr(module, "read_log", lambda *supplied: (looks.append(supplied), genuine(*supplied))[1])
+        monkeypatch.setattr(module, "read_log", lambda *supplied: (polls.append(supplied), genuine(*supplied))[1])
     monkeypatch.setattr(log_tail, "FRESH", 3600.0)  # the machine may be busy for longer than the node's word counts
     for number in range(30):
         talk.say(f"line {number}")
         wait_for(lambda: all(map(talk.has_all, everyone)))
-    assert not looks
+    assert not polls
     talk.say("end")
     for thread in talk.threads:
         thread.join(120)

@@ -143,7 +143,7 @@ def test_automatic_evaluations_have_the_share_that_the_trainings_owner_has_now(l
 
     def evaluated(iteration: int) -> str:
         add_checkpoint(lab.server.store, "taught", iteration)
-        lab.server.evaluations.look()
+        lab.server.evaluations.poll()
         found = lab.clients["token"].get("/api/runs/taught")["automatic"]
         assert found["iteration"] == iteration and found["problem"] is None, found
         detail = lab.clients["token"].get(f"/api/jobs/{found['job']}")

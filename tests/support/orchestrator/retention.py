@@ -48,8 +48,8 @@ class World:
 
     def reasons(self) -> dict[str, str]:
         """Of each run that is kept, why."""
-        looks, _ = self.step(take=False)
-        return {each["run"]: "; ".join(each["kept"]) for each in looks if each["kept"]}
+        steps, _ = self.step(take=False)
+        return {each["run"]: "; ".join(each["kept"]) for each in steps if each["kept"]}
 
     def ended(self, name: str, *, run: str | None = None, directory: bool = True, **facts: Any) -> None:
         """A job with an attempt, a node, an owner and a run with a log."""

@@ -11,11 +11,11 @@ from orchestrator.engines.api import (
     Gang,
     GangStatus,
     Handle,
-    Look,
     NodePhase,
     NodeStatus,
     NotYet,
     Plan,
+    StatusOrError,
     Traits,
     node_plans,
 )
@@ -59,7 +59,7 @@ class SimulatedEngine:
         self._reach()  # the answer may be lost
         return Handle(self.name, gang.name, len(plan.nodes), {})
 
-    def observe(self, handles: Sequence[Handle]) -> Sequence[Look]:
+    def observe(self, handles: Sequence[Handle]) -> Sequence[StatusOrError]:
         self._reach()
         return one_by_one(self._observe, handles)
 

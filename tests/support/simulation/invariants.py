@@ -85,7 +85,7 @@ class Invariants:
         if by is None or job.urgent or not by.urgent or by.id not in known:
             raise Violation(f"{gang.name} is ended without a cause: {ending}, {reason}")
 
-    def look(self) -> None:
+    def poll(self) -> None:
         """What a user sees now: nothing acknowledged is lost, and each state has a reason."""
         found = self._world.memory.execute("SELECT id, status, status_reason FROM jobs").fetchall()
         rows = {job_id: (status, reason) for job_id, status, reason in found}

@@ -163,7 +163,7 @@ class Simulation:
         self._tick_at(self.machine.time + _TICK)
         if self._committed:
             self._committed = False
-            self.invariants.look()
+            self.invariants.poll()
         self.invariants.check_reachable(process)
 
     def die(self) -> None:

@@ -102,7 +102,7 @@ def test_a_poll_near_the_end_reads_only_the_end(tmp_path: Path, monkeypatch: pyt
         return genuine(view, offset, size)
 
     monkeypatch.setattr(LogSnapshot, "_read", counting)
-    view = file.look()
+    view = file.snapshot()
     found = [event.text.split()[1] for event in view.forward(since=int(1e12) + 999_900)]
     assert found == [str(i) for i in range(99_990, 100_000)]
     assert sum(read) < 70_000 < view.end // 100
@@ -119,8 +119,8 @@ def test_any_start_and_any_look_give_the_same_events(tmp_path: Path) -> None:
             line = format_line(clock, dice.choice([None, 0, 12]), "e", text)
             written += dice.choice([b"torn\n", b"\n", b"\xff\x00 o \n"]) if dice.random() < 0.02 else line.encode()
         path.write_bytes(written + b"2026-01-01T00:00:0")
-        file.look()
-    view, expected, offset, top = file.look(), [], 0, 0
+        file.snapshot()
+    view, expected, offset, top = file.snapshot(), [], 0, 0
     for raw in written.splitlines(keepends=True):
         if match := log_events._STAMPS.match(raw):
             top = max(top, log_events.milliseconds(match[1].decode()))
@@ -129,7 +129,7 @@ def test_any_start_and_any_look_give_the_same_events(tmp_path: Path) -> None:
     assert view.end == len(written) and view.top == top and len(view.marks) > 5
     for _ in range(100):
         since, start = dice.choice(expected)[0] + dice.randrange(-1, 2), dice.randrange(len(written) + 9)
-        fresh = view if dice.random() < 0.5 else LogFile(path, "s").look()
+        fresh = view if dice.random() < 0.5 else LogFile(path, "s").snapshot()
         found = [(e.time, e.offset, e.end) for e in fresh.forward(since, start)]
         assert found == [e for e in expected if e[0] >= since and e[1] >= start]
         back = [(e.time, e.offset, e.end) for e in fresh.backward(since, start)]

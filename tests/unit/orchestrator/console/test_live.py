@@ -20,7 +20,7 @@ from orchestrator.console.live import Recent, ServerSentEvent, stream
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run, Store
-from shared_store.volume.metrics import MetricsWriter, sampled
+from shared_store.volume.metrics import MetricsWriter
 
 
 def request_of(**headers: str) -> Request:
@@ -31,9 +31,9 @@ def request_of(**headers: str) -> Request:
     return cast(Request, request)
 
 
-def written(looks: Sequence[Callable[[], Sequence[ServerSentEvent] | None]]) -> list[str]:
+def written(reads: Sequence[Callable[[], Sequence[ServerSentEvent] | None]]) -> list[str]:
     """The blocks of a stream whose looks find these."""
-    left: Iterator[Callable[[], Any]] = iter(looks)
+    left: Iterator[Callable[[], Any]] = iter(reads)
 
     async def read() -> str:
         answer = stream(request_of(authorization="Bearer x"), lambda: next(left)(), interval=0)
@@ -115,12 +115,12 @@ def test_an_iteration_that_is_written_between_two_looks_at_the_run_is_sent_once(
     with MetricsWriter(run, 1, 0) as metrics:
         metrics.write({"iteration": 1})
 
-        def look(run: Run, most: int) -> list[dict[str, Any]]:
+        def sampled(run: Run, most: int) -> list[dict[str, Any]]:
             found = sampled(run, most)
             metrics.write({"iteration": found[-1]["iteration"] + 1})
             return found
 
-        monkeypatch.setattr(curves, "sampled", look)
+        monkeypatch.setattr(curves, "sampled", sampled)
         new = NewIterations(run, 0)
         sent = [event.data["iterations"] for _ in range(3) for event in new.changes()]
     assert sent == [[1, 2], [3, 4]]

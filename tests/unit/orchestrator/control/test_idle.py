@@ -83,12 +83,12 @@ def test_a_pass_in_which_nothing_changed_reads_and_writes_nothing(
     bench: tuple[FakeController[FakeEngine], Costs],
 ) -> None:
     controller, costs = bench
-    looks = controller.engine.looks
+    polls = controller.engine.polls
 
     def passes() -> None:
         for _ in range(10):
             controller.controller.tick()
-        controller.ticks(lambda: controller.engine.looks > looks + 2)  # the engine is looked at all the same
+        controller.ticks(lambda: controller.engine.polls > polls + 2)  # the engine is looked at all the same
 
     costs.watched(passes)
     assert (costs.statements, costs.store, costs.files) == ([], [], [])

@@ -124,13 +124,13 @@ def test_the_look_for_what_nothing_needs_is_made_soon_after_a_start_and_then_rar
     texts: KeptTexts, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     requested: list[Any] = []
-    for seconds, looks in ((0, 0), (59, 0), (61, 1), (3600, 1), (3662, 2)):
+    for seconds, polls in ((0, 0), (59, 0), (61, 1), (3600, 1), (3662, 2)):
         moment = machine.monotonic() + seconds
         with monkeypatch.context() as patch:
             patch.setattr(machine, "monotonic", lambda moment=moment: moment)
             texts.sweep_when_due(requested.append)
             texts.sweep_when_due(requested.append)
-        assert requested == [texts.sweep] * looks, seconds
+        assert requested == [texts.sweep] * polls, seconds
 
 
 def test_leftovers_of_a_killed_upload_go_and_other_controllers_texts_stay(texts: KeptTexts, store: Store) -> None:

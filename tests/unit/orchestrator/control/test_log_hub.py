@@ -126,7 +126,7 @@ def has(pieces: list[str], *texts: str) -> bool:
 
 
 @pytest.fixture
-def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+def polls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     """How often the hub and the followers have read a log file."""
     found: Counter[str] = Counter()
     genuine = read_log
@@ -143,16 +143,16 @@ def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
     return found
 
 
-def test_a_lost_push_costs_one_look_for_all_followers(world: World, looks: Counter[str]) -> None:
+def test_a_lost_push_costs_one_look_for_all_followers(world: World, polls: Counter[str]) -> None:
     everyone = [world.follow() for _ in range(20)]
     world.settle()
     world.write("first")
     wait_for(lambda: all(has(each, "first") for each in everyone))
-    looks.clear()
+    polls.clear()
     world.write("lost", push=False)
     world.state()
     wait_for(lambda: all(has(each, "lost") for each in everyone))
-    assert looks["hub"] <= 2 and not looks["followers"]
+    assert polls["hub"] <= 2 and not polls["followers"]
 
 
 def test_a_supervisor_that_knows_no_pushes_any_more_is_read_and_asked_again(
@@ -280,24 +280,24 @@ def test_looks_become_rare_while_they_find_nothing_and_frequent_again_with_a_cha
 ) -> None:
     clock = 1000.0
     monkeypatch.setattr(log_hub, "machine", SimpleNamespace(monotonic=lambda: clock))
-    job, looks = log_hub._Followed(world.run, "job"), 0
-    genuine = job.logs.look
+    job, polls = log_hub._Followed(world.run, "job"), 0
+    genuine = job.logs.poll
 
-    def look() -> bool:
-        nonlocal looks
-        looks += 1
+    def poll() -> bool:
+        nonlocal polls
+        polls += 1
         return genuine()
 
-    monkeypatch.setattr(job.logs, "look", look)
+    monkeypatch.setattr(job.logs, "poll", poll)
 
     def looks_in(seconds: float) -> int:
         nonlocal clock
-        before = looks
+        before = polls
         for _ in range(round(seconds / 0.05)):
             clock += 0.05001
             world.hub._round([job])
             wait_for(lambda: not job.is_polled)
-        return looks - before
+        return polls - before
 
     assert looks_in(2.0) >= 20, "after a tenth of the silence"
     assert 10 <= looks_in(8.0) <= 20

@@ -37,7 +37,7 @@ class Followed:
         """Pushes that have not come."""
         self.written = 0
         self.logs.note(1, 1)
-        self.logs.look()
+        self.logs.poll()
         self.view.poll()
 
     def write(self, *texts: str, push: bool = True, visible: bool = True) -> None:
@@ -100,7 +100,7 @@ def test_a_log_that_was_truncated_is_read_from_its_new_beginning(job: Followed) 
     job.path.write_bytes(b"")
     job.write("three", push=False)
     assert job.state()
-    job.logs.look()
+    job.logs.poll()
     assert job.read() == ["one", "two", REPLACED, "three"]
 
 
@@ -121,7 +121,7 @@ def test_memory_is_bounded_and_a_slow_reader_goes_on_in_the_files(job: Followed)
         job.write(f"{number} {text}", push=number % 2 == 0)
     assert sum(map(len, kept.early.values())) <= MOST
     assert job.state()
-    job.logs.look()
+    job.logs.poll()
     assert [int(each.split()[0]) for each in job.read()] == list(range(400))
 
 
@@ -130,7 +130,7 @@ def test_a_reader_that_comes_too_late_hears_what_was_left_out(tmp_path: Path) ->
     for number in range(1500):
         job.write(f"{number} " + "x" * 2000, push=number % 100 != 0)
     while job.state():
-        job.logs.look()
+        job.logs.poll()
     texts = job.read()
     assert texts[0].startswith("0 ") and texts[-1].startswith("1499 ")
     assert sum("left out: the log reached its limit" in text for text in texts) == 1
@@ -166,7 +166,7 @@ def test_a_last_burst_that_was_not_pushed_is_read_though_the_volume_s_cached_siz
     assert job.read(memory_alone=True) == ["pushed"]
     job.write("burst", push=False)
     if reader == "the hub":
-        assert job.logs.look() and job.read(memory_alone=True) == ["pushed", "burst"]
+        assert job.logs.poll() and job.read(memory_alone=True) == ["pushed", "burst"]
     else:
         assert [line.text for line in job.view.drain()] == ["burst"]
 
@@ -176,7 +176,7 @@ def test_the_last_look_gives_no_line_twice_where_the_volume_shows_the_log_late_o
 ) -> None:
     job = Followed(tmp_path / "run", LEAST_LOG_LIMIT)
     job.write("in the first file", push=False)
-    job.logs.look()
+    job.logs.poll()
     assert [line.text for line in job.view.poll()] == ["in the first file"]
     for number in range(300):
         job.write(f"{number} " + "x" * 2000)
@@ -194,7 +194,7 @@ def test_a_reader_visits_the_logs_that_have_changed_alone(tmp_path: Path, monkey
     logs, nodes = JobLogs(Run(tmp_path), "job"), 1000
     view = LogView.of(logs.run, "job")
     logs.note(1, nodes)
-    logs.look()
+    logs.poll()
     view.poll()
     data = format_line(1_800_000_000.0, 0, "o", "text").encode()
     for node in range(nodes):
@@ -242,7 +242,7 @@ def test_whatever_happens_to_pushes_and_files_every_line_is_read_once_and_in_ord
             elif what == "unknown":
                 job.logs.state(LOG, None, False)
             elif what == "look":
-                job.logs.look()
+                job.logs.poll()
             elif what == "read":
                 job.read()
             elif job.late:
@@ -253,5 +253,5 @@ def test_whatever_happens_to_pushes_and_files_every_line_is_read_once_and_in_ord
                     job.late.pop(index) if what == "lose" else job.deliver(index)
         job.show()
         job.state()
-        job.logs.look()
+        job.logs.poll()
         assert job.read() == [f"line {number}" for number in range(job.written)]

@@ -44,7 +44,7 @@ class Gang:
     def _outcomes(self, _run: str, _job: str, _attempt: int, nodes: Sequence[int]) -> dict[int, Outcome]:
         return {index: self.written[index] for index in nodes if index in self.written}
 
-    def look(self, *status: NodeStatus) -> Any:
+    def poll(self, *status: NodeStatus) -> Any:
         self.status = list[NodeStatus](status)
         return self.observer.observe(self.job, self.job.attempts[0])
 
@@ -55,13 +55,13 @@ class Gang:
 @pytest.mark.parametrize("end", [ended("", None), NodeStatus(NodePhase.ENDED, cause=Cause.EXIT, exit_code=0)])
 def test_an_outcome_that_was_not_there_before_the_node_ended_is_looked_for_again(end: NodeStatus) -> None:
     gang = Gang()
-    assert isinstance(gang.look(ABSENT, ABSENT), Observed), "what can't be seen is looked for, and not waited for"
+    assert isinstance(gang.poll(ABSENT, ABSENT), Observed), "what can't be seen is looked for, and not waited for"
     gang.pool.carry_out()  # it finds nothing
     gang.write(0, 0)
     running: GangStatus = [end, NodeStatus(NodePhase.RUNNING)]
-    assert gang.look(*running).unread == ""
+    assert gang.poll(*running).unread == ""
     gang.pool.carry_out()
-    seen = gang.look(*running)
+    seen = gang.poll(*running)
     assert isinstance(seen, Observed) and seen.ends[1] is None
     assert seen.ends[0] is not None and (seen.ends[0].exit_code, seen.ends[0].reason) == (0, "exit 0")
 
@@ -70,55 +70,55 @@ def test_an_outcome_that_was_not_there_before_the_node_ended_is_looked_for_again
 def test_outcomes_of_nodes_that_an_earlier_controller_met_are_looked_for_only_where_there_is_a_bus(is_on: bool) -> None:
     gang, runs = Gang("tcp/127.0.0.1:7447" if is_on else None), NodeStatus(NodePhase.RUNNING)
     gang.presence.expect("job", 1, 2, met=[0, 1])
-    seen = gang.look(runs, runs)
+    seen = gang.poll(runs, runs)
     assert isinstance(seen, Observed) and [each is not None for each in seen.silences] == [is_on] * 2
     assert bool(gang.pool.calls) is is_on and gang.observer.has_hidden(("job", 1)) is is_on
     for node in range(2):
         gang.presence.came(("job", 1, node))
-    gang.look(runs, runs)
+    gang.poll(runs, runs)
     assert not gang.observer.has_hidden(("job", 1))
 
 
 @pytest.mark.parametrize("hidden", [ABSENT, NodeStatus(NodePhase.RUNNING, stale="slurmctld is away")])
 def test_a_node_that_its_engine_can_t_see_is_looked_for_again_soon_also_without_a_bus(hidden: NodeStatus) -> None:
     gang = Gang(None)
-    gang.look(hidden, NodeStatus(NodePhase.RUNNING))
+    gang.poll(hidden, NodeStatus(NodePhase.RUNNING))
     assert gang.observer.has_hidden(("job", 1))
     gang.write(0, 0)
     gang.pool.carry_out()
     for _ in range(2):  # the first one takes what was read
-        gang.look(hidden, NodeStatus(NodePhase.RUNNING))
+        gang.poll(hidden, NodeStatus(NodePhase.RUNNING))
     assert not gang.observer.has_hidden(("job", 1)), "its outcome is known"
 
 
 def test_a_node_that_ends_while_others_are_looked_for_is_not_taken_for_one_without_an_outcome() -> None:
     gang = Gang()
-    gang.look(ABSENT, ABSENT)
+    gang.poll(ABSENT, ABSENT)
     body, future = gang.pool.calls.pop()
     found = body()  # by now it has found none
     gang.write(0, 0)
     future.set_result(found)
     running: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
-    assert gang.look(*running).unread == ""
+    assert gang.poll(*running).unread == ""
     gang.pool.carry_out()
-    seen = gang.look(*running)
+    seen = gang.poll(*running)
     assert isinstance(seen, Observed) and seen.ends[0] is not None and seen.ends[0].exit_code == 0
 
 
 def test_a_node_that_ends_while_outcomes_are_read_again_after_an_error_is_looked_for_by_itself() -> None:
     gang = Gang()
     one: GangStatus = [ended("", None), NodeStatus(NodePhase.RUNNING)]
-    assert gang.look(*one).unread == ""
+    assert gang.poll(*one).unread == ""
     _, failed = gang.pool.calls.pop()
     failed.set_exception(StoreUnavailable("away"))
-    assert gang.look(*one).unread == "away"
+    assert gang.poll(*one).unread == "away"
     gang.observer._errands._failing.hurry(("job", 1))
-    gang.look(*one)  # the call that is under way from now on reads node 0 alone
+    gang.poll(*one)  # the call that is under way from now on reads node 0 alone
     gang.write(1, 0)
     both: GangStatus = [ended("", None), ended("", None)]
-    assert gang.look(*both).ends == [None, None]
+    assert gang.poll(*both).ends == [None, None]
     gang.pool.carry_out()
-    gang.look(*both)
+    gang.poll(*both)
     gang.pool.carry_out()
-    first, second = gang.look(*both).ends
+    first, second = gang.poll(*both).ends
     assert (first.exit_code, second.exit_code) == (137, 0)

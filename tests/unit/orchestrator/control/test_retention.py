@@ -148,9 +148,9 @@ def test_steps_go_past_what_is_kept_and_count_each_job_once(world: World, monkey
     place: Cursor | None = Cursor()
     seen: list[str] = []
     while place is not None:
-        looks, place = world.step(place, take=False, most=3)
+        steps, place = world.step(place, take=False, most=3)
         place = None if place is None else Cursor.read(str(place))
-        seen += [each["run"] for each in looks]
+        seen += [each["run"] for each in steps]
     assert sorted(seen) == [f"j{number:02}" for number in range(17)]
     place = Cursor()
     while place is not None:
@@ -264,8 +264,8 @@ def test_rules_of_queues_and_of_the_controller(world: World) -> None:
         world.ended(queue, queue=queue, stopped_at=day, from_yaml=True)
     assert world.retention(default=inf).take_all().jobs == 1 and world.jobs() == ["bad", "default", "deleted", "kept"]
     assert world.retention(default=2 * 86_400).take_all().jobs == 0
-    looks, _ = world.step(take=True, default=A_DAY // 2)
-    assert [each["jobs"] for each in looks] == [["default"]]
+    steps, _ = world.step(take=True, default=A_DAY // 2)
+    assert [each["jobs"] for each in steps] == [["default"]]
     world.ended("default", stopped_at=day, from_yaml=True)
     assert world.retention(default=3600).take_all().jobs == 1 and world.jobs() == ["bad", "deleted", "kept"]
     world.add(JobQueue(name="deleted", compute_environments=["local"], tags={"muster:retention": "1m"}))
@@ -318,8 +318,8 @@ def test_a_key_with_some_queues_takes_only_what_is_its_own(world: World) -> None
     with world.database.session() as session:
         session.get_one(RunRecord, "shared").owner = "key a"
         session.get_one(RunRecord, "of-b").owner = "key b"
-    looks, _ = world.step(take=True, by=mine)
-    gone = sorted(name for each in looks for name in each["jobs"])
+    steps, _ = world.step(take=True, by=mine)
+    gone = sorted(name for each in steps for name in each["jobs"])
     assert gone == ["own", "shared"]
     assert world.runs() == ["elsewhere", "of-b", "others", "shared"]
     assert not (world.store.run("shared").path / "logs" / "shared").exists()

@@ -69,8 +69,8 @@ def test_a_log_that_can_t_be_moved_keeps_its_job_alone(world: World) -> None:
     held = run.path / "outcomes" / "a"
     held.chmod(0o555)
     with permissions_count():
-        [look], _ = world.step(take=True)
-        assert look["jobs"] == ["b"] and look["kept"] == [
+        [step], _ = world.step(take=True)
+        assert step["jobs"] == ["b"] and step["kept"] == [
             f"it can't be moved into the store's trash (Permission denied: {held})"
         ]
         held.chmod(0o755)

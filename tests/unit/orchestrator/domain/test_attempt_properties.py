@@ -43,7 +43,7 @@ prepares = st.one_of(
     *(st.none(), st.just(Delayed("silent")), st.just(StartRefused("refused"))),
 )
 launches = st.one_of(*[st.just(Launched("handle"))] * 4, delays, st.just(StartRefused("refused")))
-looks = st.builds(Observed, moments, both, silences, words, words, words)
+polls = st.builds(Observed, moments, both, silences, words, words, words)
 gone = st.builds(Gone, moments, both | st.just([]), words)
 stops = st.one_of(gone, gone, gone, st.none(), st.just(Delayed("not allowed")))
 
@@ -60,9 +60,9 @@ class Turn:
     stop: Event | None
 
 
-out_of_place = st.one_of(launches, looks, gone)
+out_of_place = st.one_of(launches, polls, gone)
 before = st.one_of(*[st.none()] * 4, st.just("enough"), st.just(Preempted("preempted by job b")), out_of_place)
-turns = st.builds(Turn, before, prepares, launches, looks, stops)
+turns = st.builds(Turn, before, prepares, launches, polls, stops)
 policies = st.sampled_from(["ignore", "restart", "fail"])
 terms = st.builds(
     attempt.Terms,
@@ -179,7 +179,7 @@ def test_a_stop_that_was_asked_for_is_not_forgotten(story: list[Page]) -> None:
 
 
 @settings(max_examples=50)
-@given(stories, looks)
+@given(stories, polls)
 def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_reason_or_brings_the_end_about(
     story: list[Page], seen: Observed
 ) -> None:
@@ -187,8 +187,8 @@ def test_an_attempt_that_is_not_closed_has_a_next_look_and_each_look_gives_a_rea
         state = page.now
         if state.closed:
             continue
-        next_look = do.Observe if state.launched else do.Launch if state.prepared else do.Prepare
-        expected = next_look if state.prepared or (state.verdict is None and state.stop_reason is None) else do.WindUp
+        next_poll = do.Observe if state.launched else do.Launch if state.prepared else do.Prepare
+        expected = next_poll if state.prepared or (state.verdict is None and state.stop_reason is None) else do.WindUp
         assert isinstance(attempt.step(state, Due())[-1], expected)
         follows = attempt.step(state, seen) if state.launched else ()
         if state.verdict is not None or any(isinstance(each, do.Decide) for each in follows):

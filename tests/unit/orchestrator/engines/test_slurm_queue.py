@@ -81,7 +81,7 @@ def cluster(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cluster
         yield made
 
 
-def looks(engine: slurm.SlurmEngine, cluster: Cluster, seconds: float) -> int:
+def polls(engine: slurm.SlurmEngine, cluster: Cluster, seconds: float) -> int:
     """How often squeue is asked while the engine looks five times a second at all jobs, for so many seconds."""
     before, handles = cluster.requested, [cluster.handle(number) for number in cluster.states]
     for _ in range(round(5 * seconds)):
@@ -93,27 +93,27 @@ def looks(engine: slurm.SlurmEngine, cluster: Cluster, seconds: float) -> int:
 def test_squeue_is_asked_once_a_second_for_few_gangs_and_twice_a_minute_for_many(cluster: Cluster) -> None:
     cluster.states = {str(number): "RUNNING" for number in range(10)} | {"77": "COMPLETED"}
     engine = slurm.SlurmEngine()
-    assert 40 <= looks(engine, cluster, 60.0) <= 60
+    assert 40 <= polls(engine, cluster, 60.0) <= 60
     cluster.states["10"] = "PENDING"
-    looks(engine, cluster, 3.0)
-    assert 1 <= looks(engine, cluster, 60.0) <= 3
+    polls(engine, cluster, 3.0)
+    assert 1 <= polls(engine, cluster, 60.0) <= 3
     for number in ("0", "1", "2"):
         cluster.states[number] = "COMPLETED"
-    looks(engine, cluster, 31.0)
-    assert 40 <= looks(engine, cluster, 60.0) <= 60, "and often again once they are few"
+    polls(engine, cluster, 31.0)
+    assert 40 <= polls(engine, cluster, 60.0) <= 60, "and often again once they are few"
 
 
 def test_the_interval_of_squeue_can_be_set_and_a_failure_is_tried_again_sooner(cluster: Cluster) -> None:
     cluster.states = {"1": "RUNNING"}
     cluster.begin("1")
     engine = slurm.SlurmEngine(120.0)
-    assert looks(engine, cluster, 600.0) in (4, 5)
+    assert polls(engine, cluster, 600.0) in (4, 5)
     cluster.absent = True
-    looks(engine, cluster, 121.0)
+    polls(engine, cluster, 121.0)
     [status] = engine.observe([cluster.handle("1")])
     assert isinstance(status, list) and status[0].stale == "Slurm: slurmctld does not answer"
     cluster.absent = False
-    assert looks(engine, cluster, 6.0) == 1
+    assert polls(engine, cluster, 6.0) == 1
     [status] = engine.observe([cluster.handle("1")])
     assert isinstance(status, list) and status[0].stale == ""
 

@@ -27,41 +27,41 @@ def saved(*iterations: int, epoch: int = 1) -> list[Checkpoint]:
     return [Checkpoint(Path(f"{each:08d}-e{epoch}"), each, epoch) for each in iterations]
 
 
-def look(checkpoints: list[Checkpoint], counted: Counted, *, every: int = 2, busy: bool = False) -> tuple[Counted, int]:
+def poll(checkpoints: list[Checkpoint], counted: Counted, *, every: int = 2, busy: bool = False) -> tuple[Counted, int]:
     """What is known after a look, and the iteration that is due; 0 where none is."""
     known, chosen = due(checkpoints, counted, every, 100, busy)
     return known, chosen.iteration if chosen else 0
 
 
 def test_every_second_checkpoint_of_the_job_is_due_however_many_retention_has_left() -> None:
-    known, found = look(saved(10), Counted())
+    known, found = poll(saved(10), Counted())
     assert (known, found) == (Counted("00000010-e1", 1), 0)
-    known, found = look(saved(10), known)
+    known, found = poll(saved(10), known)
     assert (known, found) == (Counted("00000010-e1", 1), 0), "nothing new"
-    known, found = look(saved(20), known)
+    known, found = poll(saved(20), known)
     assert (known, found) == (Counted("00000020-e1", 0), 20)
-    assert look(saved(20), known) == (known, 0), "once"
-    known, found = look(saved(20, 30, 40), known)
+    assert poll(saved(20), known) == (known, 0), "once"
+    known, found = poll(saved(20, 30, 40), known)
     assert (known, found) == (Counted("00000040-e1", 0), 40)
     assert first_count([*saved(10, 20), *saved(30, epoch=3)], 3) == Counted("00000020-e1")
     assert first_count(saved(30, epoch=3), 3) == first_count([], 1) == Counted()
 
 
 def test_one_evaluation_runs_at_a_time_and_the_newest_checkpoint_is_next() -> None:
-    known, _ = look(saved(10, 20), Counted())
+    known, _ = poll(saved(10, 20), Counted())
     for iterations in ((10, 20, 30), (30, 40), (40, 50), (50, 60), (60, 70)):
-        known, found = look(saved(*iterations), known, busy=True)
+        known, found = poll(saved(*iterations), known, busy=True)
         assert found == 0
     assert known == Counted("00000070-e1", 5)
-    known, found = look(saved(60, 70), known)
+    known, found = poll(saved(60, 70), known)
     assert (known, found) == (Counted("00000070-e1", 0, 1), 70), "40 was due, too"
 
 
 def test_the_last_checkpoint_is_left_to_the_training_itself_and_a_later_epoch_is_newer() -> None:
-    known, found = look(saved(90, 100), Counted("00000080-e1", 0), every=1)
+    known, found = poll(saved(90, 100), Counted("00000080-e1", 0), every=1)
     assert (known, found) == (Counted("00000100-e1", 1), 0), "the training is done: 90 is not new any more"
-    assert look(saved(90), Counted("00000080-e1", 0), every=1)[1] == 90
-    known, found = look([*saved(50, 60), *saved(30, 40, epoch=2)], Counted("00000060-e1", 0))
+    assert poll(saved(90), Counted("00000080-e1", 0), every=1)[1] == 90
+    known, found = poll([*saved(50, 60), *saved(30, 40, epoch=2)], Counted("00000060-e1", 0))
     assert (known, found) == (Counted("00000040-e2", 0), 40)
 
 
