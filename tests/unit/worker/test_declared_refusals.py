@@ -161,7 +161,7 @@ SCANNED: Mapping[str, Any] = {
     "observations": {"a": Observation(terms.frame_clearance, points=5)},
 }
 NUMBERS: Mapping[str, tuple[Any, str]] = {
-    "rewards.plac.x": (1.0, "the task has no number 'rewards.plac.x'; there are"),
+    "rewards.plac.x": (1.0, "the task has no number 'rewards.plac.x'; available: "),
     "randomize.mas.range": ([1.0, 2.0], "the task has no number 'randomize.mas.range'; did you mean"),
     "actions.force.scale": (1.0, "expected 2 numbers, found 1.0"),
     "randomize.mass.range": ([-3.0, -2.0], "randomize mass: the range (-3.0, -2.0) would make mass negative"),

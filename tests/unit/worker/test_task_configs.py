@@ -230,7 +230,7 @@ def test_an_unknown_class_is_refused_with_the_tasks_of_its_module(folder: Path) 
         "Draft = Mine.with_(config={'substeps': 3})\n"
     )
     with pytest.raises(
-        ValueError, match=r"own has no class 'Nope' that is a worker\.tasks\.Task; there are Mine, Draft$"
+        ValueError, match=r"own has no class 'Nope' that is a worker\.tasks\.Task; available: Mine, Draft$"
     ):
         find_task("own:Nope")
     sys.modules.pop("own", None)

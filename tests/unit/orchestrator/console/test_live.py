@@ -115,12 +115,12 @@ def test_an_iteration_that_is_written_between_two_looks_at_the_run_is_sent_once(
     with MetricsWriter(run, 1, 0) as metrics:
         metrics.write({"iteration": 1})
 
-        def sampled(run: Run, most: int) -> list[dict[str, Any]]:
+        def sampled_then_written(run: Run, most: int) -> list[dict[str, Any]]:
             found = sampled(run, most)
             metrics.write({"iteration": found[-1]["iteration"] + 1})
             return found
 
-        monkeypatch.setattr(curves, "sampled", sampled)
+        monkeypatch.setattr(curves, "sampled", sampled_then_written)
         new = NewIterations(run, 0)
         sent = [event.data["iterations"] for _ in range(3) for event in new.changes()]
     assert sent == [[1, 2], [3, 4]]

@@ -41,7 +41,7 @@ def runner(engine: FakeEngine) -> Iterator[Runner]:
 def test_a_stop_does_not_wait_for_ever_for_the_last_look_of_an_engine_that_hangs(
     engine: FakeEngine, runner: Runner, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runner_module, "_LAST_LOOK", 0.05)
+    monkeypatch.setattr(runner_module, "_LAST_POLL", 0.05)
     handle = engine.launch(engine.plan(GANG))
     engine.answers.clear()
     with pytest.raises(Transient, match=r"^the fake engine has not reported how the gang ended$"):

@@ -195,7 +195,7 @@ def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_begin
     path = run.log("job", 1, 0)
     LogWriter(path).append(lines_of(0, 100))
     follower, file = LogView.of(run, "job"), LogFile(path, "stream")
-    assert len(follower.poll()) == 100 and file.look().started == 1
+    assert len(follower.poll()) == 100 and file.snapshot().started == 1
     if how == "truncated":
         os.truncate(path, 0)
         assert [line.text for line in follower.poll()] == [REPLACED]
@@ -206,7 +206,7 @@ def test_a_truncated_or_replaced_log_is_reported_and_followed_from_its_new_begin
     assert texts[0] == REPLACED or how == "truncated"
     assert numbers(texts)[0] == 500 and len(numbers(texts)) == (60 if "shorter" in how else 300)
     assert [line.text for line in follower.poll()] == []
-    view = file.look()
+    view = file.snapshot()
     assert view.started == 2 and numbers([event.text for event in view.forward()])[0] == 500
 
 
@@ -215,9 +215,9 @@ def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: R
     early, writer = LogFile(path, "stream"), LogWriter(path, LIMIT)
     for first in range(0, 8000, 1400):
         more(writer, first, min(first + 1400, 8000))
-        early.look()
-    late = LogFile(path, "stream").look()
-    seen = list(early.look().forward())
+        early.snapshot()
+    late = LogFile(path, "stream").snapshot()
+    seen = list(early.snapshot().forward())
     assert seen == list(late.forward()) == list(late.backward())[::-1]
     gap = next(event for event in seen if event.text.startswith("…"))
     texts = drained(run)
@@ -233,7 +233,7 @@ def test_events_of_a_long_log_are_the_same_for_whoever_looks_and_whenever(run: R
 def test_a_view_survives_the_deletion_of_files_that_it_knows(run: Run) -> None:
     path = run.log("job", 1, 0)
     writer = written(path, 2400)
-    view = LogFile(path, "stream").look()
+    view = LogFile(path, "stream").snapshot()
     more(writer, 2400, 8000)
     assert numbers([event.text for event in view.forward()])[:700] == list(range(700))
 
@@ -264,7 +264,7 @@ def test_one_look_passes_over_a_bounded_part_of_a_hole_and_the_next_one_goes_on(
         file.truncate(len(first) + (6 << 20))
         file.write(b"\n" + last)
     log = LogFile(path, "stream")
-    assert log.look().end < 5.5 * (1 << 20)
-    view = log.look()
+    assert log.snapshot().end < 5.5 * (1 << 20)
+    view = log.snapshot()
     assert view.end == path.stat().st_size
     assert numbers([event.text for event in view.backward()]) == [1, 0]
