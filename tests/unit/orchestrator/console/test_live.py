@@ -20,7 +20,7 @@ from orchestrator.console.live import Recent, ServerSentEvent, stream
 from orchestrator.domain.errors import ClientError
 from orchestrator.services.permissions import CONTROLLER
 from shared_store.volume.layout import Run, Store
-from shared_store.volume.metrics import MetricsWriter
+from shared_store.volume.metrics import MetricsWriter, sampled
 
 
 def request_of(**headers: str) -> Request:
