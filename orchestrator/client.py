@@ -248,8 +248,11 @@ class Client:
             message = answer.json()["message"]
         except (ValueError, KeyError, TypeError):
             message = f"{answer.request.url} answered {answer.status_code}; is that a Muster controller?"
-        is_absent = answer.status_code in (502, 503, 504)  # 502 and 504: of a proxy without its controller
-        raise (NotServing if is_absent else ApiError)(message, answer.status_code)
+        if answer.status_code in (502, 504):
+            raise Unreachable(
+                f"the proxy at {answer.request.url.host} answers {answer.status_code}: its controller is away"
+            )
+        raise (NotServing if answer.status_code == 503 else ApiError)(message, answer.status_code)
 
     def _unreachable(self, error: httpx.HTTPError) -> Unreachable:
         return Unreachable(

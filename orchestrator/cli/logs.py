@@ -52,7 +52,8 @@ def logs(
         raise SpecError(f"--grep {grep}: not a regular expression ({error})") from None
     colour, is_empty = sys.stdout.isatty(), True
     with Client.connect() as client:
-        _check_nodes(client, job, node=node, rank=rank)
+        if node:
+            _check_node(client, job, node)
         batches = log_lines(client, job, follow=follow, node=node, rank=rank, attempt=attempt)
         hint = _children_hint(client, job) if follow else ""
         if hint:
@@ -74,14 +75,12 @@ def logs(
                 echo(reason, err=True)
 
 
-def _check_nodes(client: Client, job: str, **options: int | None) -> None:
-    """Raises UsageError where an option exceeds the nodes of the job, ApiError, Unreachable."""
-    for name, value in options.items():
-        if value:
-            detail = client.get(f"/api/jobs/{named(job)}", store=False)
-            nodes = max(int(detail["nodes"]), *(len(attempt["nodes"]) for attempt in detail["attempts"]), 1)
-            if value >= nodes:
-                raise UsageError(f"--{name} {value}: job {job} has {counted(nodes, 'node')}, numbered from 0")
+def _check_node(client: Client, job: str, node: int) -> None:
+    """Raises UsageError where the job has no such node, ApiError, Unreachable."""
+    detail = client.get(f"/api/jobs/{named(job)}", store=False)
+    nodes = max([1, int(detail["nodes"]), *(len(attempt["nodes"]) for attempt in detail["attempts"])])
+    if node >= nodes:
+        raise UsageError(f"--node {node}: job {job} has {counted(nodes, 'node')}, numbered from 0")
 
 
 def _why_empty(client: Client, job: str, part: str) -> str:

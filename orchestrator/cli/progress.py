@@ -23,10 +23,8 @@ from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.metrics import warnings_of
 
 _POLL = 0.3
-_OF_LIBRARIES = re.compile(
-    r'Warp CUDA warning|\{"|(?:DEBUG|INFO|WARNING|ERROR):[\w.]+:|\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d'
-)
-"""Beginning of a line that a library logs: a machine without GPUs, JSON, or Python's logging."""
+_OF_LIBRARIES = re.compile(r'Warp CUDA warning|\{"|(?:DEBUG|INFO):[\w.]+:')
+"""Beginning of a line that a library logs: a machine without GPUs, JSON, or details by Python's logging."""
 _PLAIN_INTERVAL = 2.0
 """Seconds between two plain lines of progress."""
 
@@ -68,14 +66,14 @@ def follow(client: Client, job_id: str) -> int:
 
 @contextmanager
 def following(job_id: str) -> Iterator[None]:
-    """A block that follows a job. Where the controller refuses its requests from now on, the error says that the job continues."""
+    """A block that follows a job. Where the controller refuses its requests from now on, the error says that the job is not stopped."""
     try:
         yield
     except ApiError as error:
         if error.status != 403:
             raise
         short = reasons.short_id(job_id)
-        words = f"job {short} continues, but the controller refuses to show it: {error}; then: muster logs {short} -f"
+        words = f"job {short} is not stopped, but the controller refuses to show it now: {error}; then: muster logs {short} -f"
         raise ApiError(words, error.status) from None
 
 

@@ -34,9 +34,10 @@ def settle(session: Session, job: Job, clock: Clock) -> None:
         if failed:
             job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
         elif pending:
-            jobs = (session.get_one(Job, each) for each in pending)
+            jobs = (session.get_one(Job, each) for each in pending[:_NAMED])
             names = ", ".join(named(each.name, each.id) for each in jobs)
-            job.move(Status.PENDING, f"waits for the success of job{'s' if len(pending) > 1 else ''} {names}")
+            more = f" and {len(pending) - _NAMED} more" if len(pending) > _NAMED else ""
+            job.move(Status.PENDING, f"waits for the success of job{'s' if len(pending) > 1 else ''} {names}{more}")
         else:
             job.move(Status.RUNNABLE, WAITING)
     elif job.status == Status.RUNNABLE:

@@ -1,8 +1,8 @@
 """The hub of followed logs: nodes push their lines over the bus, and one reader a job fills what is missing for all followers.
 
 While a client follows a job, its nodes are asked to push (:data:`shared_store.contract.bus.LOG_LEASE`), and each tells once a second where its log
-ends. As long as all of them do and nothing is missing, nobody looks at a file. Otherwise (no bus, an engine without one, a lost push, a
-supervisor that knows no pushes) one look at the files serves all followers of the job. Files stay the truth.
+ends. As long as all of them do and nothing is missing, nobody polls a file. Otherwise (no bus, an engine without one, a lost push, a
+supervisor that knows no pushes) one poll of the files serves all followers of the job. Files stay the truth.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from shared_store.volume.layout import Run
 
 _MEMORY = 32 << 20
 """Bytes that all tails together keep, with what came too early, whatever their number."""
-_LOOK, _LOOK_SELDOM = 0.05, 1.0
-"""Seconds between two looks at the files of a job whose nodes do not push: after a change, and at last while looks find nothing."""
+_POLL, _POLL_SELDOM = 0.05, 1.0
+"""Seconds between two polls of the files of a job whose nodes do not push: after a change, and at last while polls find nothing."""
 _OF_SILENCE = 0.1
-"""In between: this part of the time since a look found something. So a line is late by at most a tenth of the silence before it."""
+"""In between: this part of the time since a poll found something. So a line is late by at most a tenth of the silence before it."""
 _SHARE = 0.005
-"""Seconds between two looks, for each job that is looked at: all of them together are looked at 200 times a second."""
+"""Seconds between two polls, for each job that is polled: all of them together are polled 200 times a second."""
 _AGAIN = 1.0
 """Seconds until a store or a database that can't be read is tried again."""
 _ROWS = 10.0
@@ -94,13 +94,13 @@ class _Followed:
         self.is_changed = True
         """Whether its row has to be read."""
         self.is_polled = False
-        """Whether a look is under way."""
+        """Whether a poll is under way."""
         self.polled = float("-inf")
-        """When the last look ended [s]."""
+        """When the last poll ended [s]."""
         self.found = machine.monotonic()
-        """When a look has found something, or the last attempt has begun [s]."""
+        """When a poll has found something, or the last attempt has begun [s]."""
         self.pause = 0.0
-        """Seconds from the last look to the next one."""
+        """Seconds from the last poll to the next one."""
         self.next_ask = 0.0
         self.asking = _ASK
 
@@ -110,7 +110,7 @@ class _Followed:
 
     def poll_soon(self) -> None:
         """Something has happened to the logs."""
-        self.pause = min(self.pause, _LOOK)
+        self.pause = min(self.pause, _POLL)
 
 
 class LogHub:
@@ -218,7 +218,7 @@ class LogHub:
                 pause = _AGAIN
 
     def _round(self, followed: Collection[_Followed]) -> float:
-        """Read changed rows, ask nodes to push, and look at the files of jobs whose nodes do not; returns the seconds until the next one."""
+        """Read changed rows, ask nodes to push, and poll the files of jobs whose nodes do not; returns the seconds until the next one."""
         if is_late := machine.monotonic() - self._read_at > _ROWS:
             self._read_at = machine.monotonic()
         self._read_rows([each for each in followed if each.is_changed or is_late])
@@ -274,7 +274,7 @@ class LogHub:
                 if is_new:
                     each.found = now
                     each.wake()
-                pause = min(max(_LOOK, _OF_SILENCE * (now - each.found)), _LOOK_SELDOM)
+                pause = min(max(_POLL, _OF_SILENCE * (now - each.found)), _POLL_SELDOM)
             except OSError:
                 pass
             finally:
@@ -282,7 +282,7 @@ class LogHub:
                 each.polled, each.pause, each.is_polled = machine.monotonic(), min(each.pause, pause), False
                 self._hurry_locked()
 
-        each.is_polled, each.pause = True, _LOOK_SELDOM
+        each.is_polled, each.pause = True, _POLL_SELDOM
         try:
             self._calls.submit(poll)
         except StoreSilent:

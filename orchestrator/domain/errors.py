@@ -51,4 +51,4 @@ class NoUrl(Unreachable):
 
 
 class NotServing(ApiError, Unreachable):
-    """The controller answers 503, or its proxy 502 or 504: it can't serve now, and says why. Followers wait for it as they do when it does not answer."""
+    """The controller answers 503: it can't serve now, and says why. Followers wait for it as they do when it does not answer."""

@@ -45,7 +45,7 @@ _CLOSING = 5.0
 
 _POLLS = "polls"
 """Subject of a failure to poll all gangs."""
-_LOOKING, _SELDOM = 50.0, 2.0
+_POLLING, _SELDOM = 50.0, 2.0
 """Pause between two polls of all gangs, in multiples of the processor time of the first, so that they take 2 % of a core; and its
 limit [s]."""
 
@@ -369,7 +369,7 @@ class Runner:
         try:
             self._poll([handle for handle in list(self._observed) if not self._backoff.waits(("poll", handle))])
         finally:
-            pause = min(_LOOKING * (machine.processor_time() - began), _SELDOM)
+            pause = min(_POLLING * (machine.processor_time() - began), _SELDOM)
             self._next_poll, self._is_polling = machine.monotonic() + pause, False
 
     def _poll(self, handles: Sequence[Handle]) -> None:

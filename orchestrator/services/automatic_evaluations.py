@@ -46,11 +46,11 @@ from shared_store.volume.evaluations import keep_for_evaluation, pending_checkpo
 from shared_store.volume.layout import Run
 
 LOOK = 2.0
-"""Seconds between two looks at the checkpoints of running trainings: a listing of a directory each."""
+"""Seconds between two polls of the checkpoints of running trainings: a listing of a directory each."""
 _THREADS = 4
-"""Number of looks at the same time; each may hang on the directory of its run."""
+"""Number of polls at the same time; each may hang on the directory of its run."""
 _PATIENCE = 20.0
-"""Seconds for which a look is waited for: then the next one begins."""
+"""Seconds for which a poll is waited for: then the next one begins."""
 
 log = logging.getLogger("muster.evaluations")
 
@@ -78,7 +78,7 @@ class AutomaticEvaluations:
         """
         Args:
             actor_named: The actor of that name with the rights that it has now; None where its key is gone.
-            interval: Seconds between two looks.
+            interval: Seconds between two polls.
         """
         self._controller, self._actor_named, self._interval = controller, actor_named, interval
         self._known: dict[str, _Training | None] = {}
@@ -86,7 +86,7 @@ class AutomaticEvaluations:
         self._backoff = Backoff(log)
         self._pool = machine.pool("looks at checkpoints", _THREADS)
         self._under_way: dict[str, Future[None]] = {}
-        """The last look at each subject."""
+        """The last poll of each subject."""
         self._ending = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="evaluations", daemon=True)
 
@@ -94,7 +94,7 @@ class AutomaticEvaluations:
         self._thread.start()
 
     def close(self) -> None:
-        """Stop looking; submitted evaluations continue."""
+        """Stop polling; submitted evaluations continue."""
         self._ending.set()
         if self._thread.is_alive():
             self._thread.join(timeout=10)
@@ -107,7 +107,7 @@ class AutomaticEvaluations:
                 self.poll()
 
     def poll(self) -> None:
-        """One look at the evaluations that are open and at all trainings that run; one that can't be handled does not stop the others."""
+        """One poll of the evaluations that are open and at all trainings that run; one that can't be handled does not stop the others."""
         self._backoff.tidy()
         self._isolated("open evaluations", self._close_ended)
         active = self._controller.work_queue.active()

@@ -10,7 +10,7 @@ class Refused(Exception):
     """The node can't run, or won't; the message is one line that says what differs and what to do."""
 
 
-def nearest(name: str, names: Iterable[str], what: str = "there are") -> str:
+def nearest(name: str, names: Iterable[str], what: str = "available") -> str:
     """``did you mean NAME?`` where one is close, else the known names.
 
     Args:

@@ -86,10 +86,14 @@ def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: flo
     return f"did you mean {near[0]}?" if near else otherwise or f"available: {', '.join(names) or 'none'}"
 
 
+_MOST_PLACES = 5
+
+
 def other_places(places: Iterable[Path], named: Path) -> str:
     """The further places that are wrong, as the end of a sentence about the ``named`` one; empty where there are none."""
     others = dict.fromkeys(".".join(map(str, place)) for place in places if place != named)
-    return f" (also wrong or missing: {', '.join(others)})" if others else ""
+    more = f" and {len(others) - _MOST_PLACES} more" if len(others) > _MOST_PLACES else ""
+    return f" (also wrong or missing: {', '.join(map(shown, list(others)[:_MOST_PLACES]))}{more})" if others else ""
 
 
 def unknown_iteration(run: str, iteration: object, known: Iterable[object]) -> str:

@@ -118,7 +118,7 @@ def read_contract(bundle: Path) -> Contract:
 
 
 def copy(bundle: Path, target: Path, overwrite: bool = False) -> None:
-    """Copy a bundle atomically to ``target``, and verify it.
+    """Copy a bundle to ``target``, and verify it: whole, or not at all.
 
     Args:
         bundle: The bundle.
@@ -130,13 +130,22 @@ def copy(bundle: Path, target: Path, overwrite: bool = False) -> None:
         FileExistsError: ``target`` exists.
         OSError: The volume is full or gone.
     """
+    target = Path(os.path.realpath(target))
     if os.path.lexists(target) and not overwrite:
         raise FileExistsError(errno.EEXIST, "exists already", str(target))
     with hidden_folder(target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.tmp") as hidden:
         copy_files(bundle, hidden)
-        if overwrite:
-            shutil.rmtree(target, ignore_errors=True)
-        publish(hidden, target)
+        if not os.path.lexists(target):
+            publish(hidden, target)
+            return
+        former = hidden.with_suffix(".former")
+        target.rename(former)
+        try:
+            publish(hidden, target)
+        except OSError:
+            former.rename(target)
+            raise
+    shutil.rmtree(former)
 
 
 def copy_files(bundle: Path, hidden: Path) -> None:

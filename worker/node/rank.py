@@ -36,9 +36,10 @@ _MOST_VALUES = 100
 """Names that a rank may report in all; further ones are dropped."""
 _LARGEST_NUMBER = 2**63
 _LARGEST_ERROR_FILE = 2**20
+"""Bytes; of a larger error file nothing is read."""
 _PLACE_IN_CPP = re.compile(r"\[(?:enforce fail at )?[^\]\s]*\.(?:cc|cpp|cu|h):\d+\] ?")
 _STACK_IN_CPP = re.compile(r"\n(?:Exception raised from |frame #\d+: |C\+\+ CapturedTraceback)")
-"""Bytes; of a larger error file nothing is read."""
+"""What Gloo and NCCL add to a message: the C++ file of an error, and its stack."""
 
 
 class Rank:

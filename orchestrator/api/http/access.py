@@ -75,7 +75,7 @@ class Access:
         """Where a refused caller gets a key."""
         if self.token or self.known():
             return "`muster keys list` shows the keys, `muster keys create NAME` creates one"
-        return "no key is left: on the controller's machine, `muster keys create NAME` creates one"
+        return "this controller has no key: on its machine, `muster keys create NAME` creates one"
 
     def bearer(self, credential: str) -> Actor:
         """The owner of this token, or of ``ACCESS_KEY_ID:SECRET`` of a key. Raises Refusal."""

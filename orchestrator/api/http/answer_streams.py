@@ -62,7 +62,7 @@ def pause(least: float) -> float:
 
 
 async def polled(read: Callable[[], T], calls: StoreCalls | None) -> T:
-    """The result of ``look``, from a thread that serves these answers alone; one of ``calls`` where it reads the store.
+    """The result of ``read``, from a thread that serves these answers alone; one of ``calls`` where it reads the store.
 
     Raises what it raises, StoreSilent.
     """

@@ -153,8 +153,8 @@ class Guard:
             if key is None:
                 raise Refusal(
                     "UnrecognizedClientException",
-                    f"The security token included in the request is invalid: there is no key {signed.access_key_id[:80]!r}; "
-                    f"{self.access.way_in()}",
+                    f"The security token included in the request is invalid: there is no key "
+                    f"{signed.access_key_id[:80]!r}; {self.access.way_in()}",
                 )
             signed.check(head, datetime.now(UTC))
             signed.check_signature(head, await body.read(), key.secret)

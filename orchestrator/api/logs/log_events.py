@@ -1,8 +1,8 @@
 """The events of one log file (a stream), by time and by byte position.
 
 Lines carry the clock of their host, and a clock may step back. An event's time is therefore the greatest one up to its line:
-times never fall, and they are the same at every look, by whoever and whichever server looks. A sparse index (one mark every
-32 KiB, in memory, extended by what was added since the last look) gives that time for any position, and any time's position,
+times never fall, and they are the same in every snapshot, by whichever server. A sparse index (one mark every
+32 KiB, in memory, extended by what was added since the last snapshot) gives that time for any position, and any time's position,
 without reading the rest of the file.
 """
 
@@ -27,7 +27,7 @@ from shared_store.volume.logs import END_LINE, LIMIT_REACHED, REPLACED, STAMP, L
 _BLOCK = 32 << 10
 """Bytes between two marks."""
 _MOST_SKIPPED = 64 << 20
-"""Bytes without an event that one look reads: a program can make its log a hole of any size."""
+"""Bytes without an event that one snapshot reads: a program can make its log a hole of any size."""
 _ENDS = 256 << 10
 """Bytes at either end of a file that are read for its first and its last time: more than one line."""
 
@@ -76,7 +76,7 @@ class LogFile:
     def snapshot(self) -> LogSnapshot:
         """A view of the log as it is now: whole lines only. A log that does not exist yet is empty. Raises OSError.
 
-        A look skips at most 64 MiB that hold no events; the next look continues there.
+        A snapshot skips at most 64 MiB that hold no events; the next one continues there.
         """
         with self._lock:
             self._skipped = 0
@@ -151,7 +151,7 @@ class Gap(NamedTuple):
 
 @dataclass(frozen=True)
 class LogSnapshot:
-    """A log as it was at one look."""
+    """A log as it was at one time."""
 
     file: LogFile
     segments: Sequence[LogSegment]
@@ -164,7 +164,7 @@ class LogSnapshot:
     """The newest time [ms]; 0 where there is no event."""
     gap: Gap | None
     started: int
-    """Number of times that the log began: it differs from the look before where the log was truncated or replaced."""
+    """Number of times that the log began: it differs from the snapshot before where the log was truncated or replaced."""
 
     def replaced(self) -> LogEvent:
         """The event that a follower gets when a log was truncated or replaced."""
@@ -213,13 +213,13 @@ class LogSnapshot:
             with open_regular(path) as file:
                 file.seek(offset - start)
                 return file.read(size)
-        except FileNotFoundError:  # deleted since the look
+        except FileNotFoundError:  # deleted since the snapshot
             return b""
 
 
 @lru_cache(maxsize=4096)
 def log_file(path: Path, stream: str) -> LogFile:
-    """The log at ``path``, with the facts known from earlier looks."""
+    """The log at ``path``, with the facts known from earlier snapshots."""
     return LogFile(path, stream)
 
 

@@ -102,7 +102,7 @@ def test_keys_come_and_go_without_a_restart_and_deleting_the_last_one_opens_noth
         assert "deleted key a\nthis was the last key" in done.stdout, done.stdout
         assert "its own user's requests on loopback" in done.stdout and "does not start without a key" in done.stdout
         refused(httpx.get(f"{server.url}/api/runs"), "MissingAuthenticationToken")
-        left = "no key is left: on the controller's machine"
+        left = "this controller has no key: on its machine"
         wait_for(lambda: left in call_muster("list", home=tmp_path).stderr, what="the server's look at the keys")
         for each in (other, key):
             bearer = {"Authorization": f"Bearer {each.access_key_id}:{each.secret}"}

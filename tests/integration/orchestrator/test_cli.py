@@ -173,7 +173,7 @@ def test_an_empty_selection_of_a_log_says_so(shared_server: Serving) -> None:
     shared_server.wait(job)
     done = shared_server.muster("logs", "brief", "--attempt", "9")
     assert done.stdout == "" and "job brief has no log lines of attempt 9; muster show brief" in done.stderr
-    refused(["logs", "brief", "--rank", "9"], shared_server.home, 2, "--rank 9: job brief has 1 node, numbered from 0")
+    refused(["logs", "brief", "--node", "9"], shared_server.home, 2, "--node 9: job brief has 1 node, numbered from 0")
 
 
 def test_a_log_whose_reader_has_had_enough_ends_in_order(shared_server: Serving) -> None:

@@ -356,7 +356,7 @@ class Declaration:
             existing = ", ".join(self.observations)
             if "policy" in self.images:
                 raise ValueError(
-                    f"observations: the policy sees an image alone; give a group critic of terms besides (there are: {existing})"
+                    f"observations: the policy sees an image alone; give a group critic of terms besides (available: {existing})"
                 )
             raise ValueError(f"observations: there is no group policy, only {existing}")
 
