@@ -289,7 +289,7 @@ class StoredLeague:
     def _check_number(self, number: int) -> None:
         present = self.numbers()
         if number not in present:
-            range_text = f"available: 1 to {len(present)}" if present else "there is none yet"
+            range_text = f"available: {'1 to ' if len(present) > 1 else ''}{len(present) or 'none'}"
             raise UnknownLeague(f"league {self.name}: entry {number} does not exist; {range_text}")
 
     def _sealed(self, folder: Path, name: str, what: str) -> tuple[dict[str, Any], str]:

@@ -93,7 +93,11 @@ def other_places(places: Iterable[Path], named: Path) -> str:
     """The further places that are wrong, as the end of a sentence about the ``named`` one; empty where there are none."""
     others = dict.fromkeys(".".join(map(str, place)) for place in places if place != named)
     more = f" and {len(others) - _MOST_PLACES} more" if len(others) > _MOST_PLACES else ""
-    return f" (also wrong or missing: {', '.join(map(shown, list(others)[:_MOST_PLACES]))}{more})" if others else ""
+    return (
+        f" (also wrong or missing: {', '.join(each[:60] for each in list(others)[:_MOST_PLACES])}{more})"
+        if others
+        else ""
+    )
 
 
 def unknown_iteration(run: str, iteration: object, known: Iterable[object]) -> str:
