@@ -120,7 +120,9 @@ def submission() -> set[str]:
                 break
             time.sleep(0.5)
         server.send_signal(signal.SIGUSR2)
-        time.sleep(1)
+        while not Path(scratch, "server").exists():
+            time.sleep(0.1)
+        time.sleep(1)  # until it is written
         found = [line for name in ("server", "command") for line in Path(scratch, name).read_text().splitlines()]
         subprocess.run([*muster, "stop", "cartpole"], env=home, cwd=ROOT)
         time.sleep(3)
