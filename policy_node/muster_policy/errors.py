@@ -19,7 +19,7 @@ def nearest(name: str, names: Iterable[str], what: str = "available") -> str:
         what: Begins the list of names.
     """
     known = sorted(names)
-    close = difflib.get_close_matches(name, known, n=1)
+    close = difflib.get_close_matches(name, known, n=1, cutoff=0.5)  # knee: knee_motor
     if close:
         return f"did you mean {close[0]}?"
     return f"{what}: {', '.join(known[:8])}{', …' if len(known) > 8 else ''}" if known else f"{what} none"
