@@ -88,7 +88,7 @@ def test_the_bar_shows_the_phase_and_for_how_long_unless_iterations_come(monkeyp
 def test_a_follower_that_the_controller_refuses_from_now_on_learns_that_the_job_continues() -> None:
     with (
         pytest.raises(
-            ApiError, match=r"^job 00000000 continues, but .*: a token is needed; then: muster logs 00000000 -f$"
+            ApiError, match=r"^job 00000000 is not stopped, but .*: a token is needed; then: muster logs 00000000 -f$"
         ),
         following(DETAIL["id"]),
     ):
