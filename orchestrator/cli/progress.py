@@ -83,7 +83,7 @@ def follow_main(client: Client, job_id: str) -> int:
         for line in lines:
             if line["rank"] == 0 and not _OF_LIBRARIES.match(line["text"]):
                 echo(line["text"])
-    return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id)
+    return _ended(client, job_id, err=False)
 
 
 def _cause(attempt: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -98,7 +98,12 @@ def await_end(client: Client, job_id: str) -> int:
     """Wait for a job's end without output on standard output; a failure is printed on standard error. Returns the command's exit code."""
     for _ in client.logs(job_id, follow=True):
         pass
-    return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id, err=True)
+    return _ended(client, job_id, err=True)
+
+
+def _ended(client: Client, job_id: str, err: bool) -> int:
+    """0 of a job that SUCCEEDED, else its summary and the exit code of that."""
+    return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id, err)
 
 
 def summary(client: Client, job_id: str, err: bool = False) -> int:

@@ -10,6 +10,7 @@ from orchestrator.domain.excerpts import excerpt
 from orchestrator.domain.job import WAITING, Status
 from orchestrator.domain.reasons import array_of, named
 from orchestrator.persistence.batch_models import Job
+from shared_store.contract.error_text import enumerated
 
 _NAMED = 3
 """Greatest number of failed children that an array's reason names."""
@@ -34,10 +35,9 @@ def settle(session: Session, job: Job, clock: Clock) -> None:
         if failed:
             job.move(Status.FAILED, f"Dependent Job failed: {failed[0]}")
         elif pending:
-            jobs = (session.get_one(Job, each) for each in pending[:_NAMED])
-            names = ", ".join(named(each.name, each.id) for each in jobs)
-            more = f" and {len(pending) - _NAMED} more" if len(pending) > _NAMED else ""
-            job.move(Status.PENDING, f"waits for the success of job{'s' if len(pending) > 1 else ''} {names}{more}")
+            first = [session.get_one(Job, each) for each in pending[:_NAMED]]
+            names = enumerated([named(each.name, each.id) for each in first], len(pending))
+            job.move(Status.PENDING, f"waits for the success of job{'s' if len(pending) > 1 else ''} {names}")
         else:
             job.move(Status.RUNNABLE, WAITING)
     elif job.status == Status.RUNNABLE:

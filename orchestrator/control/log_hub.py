@@ -1,7 +1,7 @@
 """The hub of followed logs: nodes push their lines over the bus, and one reader a job fills what is missing for all followers.
 
 While a client follows a job, its nodes are asked to push (:data:`shared_store.contract.bus.LOG_LEASE`), and each tells once a second where its log
-ends. As long as all of them do and nothing is missing, nobody polls a file. Otherwise (no bus, an engine without one, a lost push, a
+ends. As long as all of them do and nothing is missing, no file is polled. Otherwise (no bus, an engine without one, a lost push, a
 supervisor that knows no pushes) one poll of the files serves all followers of the job. Files stay the truth.
 """
 

@@ -225,7 +225,7 @@ class Runner:
         return inf if launch is not None and not launch.done() else self._backoff.pause(("launch", gang))
 
     def observe(self, handle: Handle) -> GangStatus | None:
-        """The newest status of a gang, of which :meth:`poll` asks for newer ones from now on; None before the first.
+        """The newest status of a gang; None before the first. From now on :meth:`poll` refreshes it.
 
         Nodes that were seen running, or not yet at all, are unreachable where there is no newer status, and say why.
         """

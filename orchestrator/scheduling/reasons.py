@@ -16,6 +16,7 @@ from orchestrator.scheduling.pass_cache import NO_ROOM, PassCache
 from orchestrator.scheduling.placement import count_of, limit_of, needs, shortage, together
 from orchestrator.scheduling.reservation import Reservation
 from orchestrator.scheduling.snapshot import Waiting
+from shared_store.contract.error_text import enumerated
 
 NO_COMPUTE_ENVIRONMENT = Reason(
     "no compute environment of its queue is enabled",
@@ -139,9 +140,7 @@ class WaitReport:
         if not awaited:
             return ""
         names = [named(each.name, each.job) for each in awaited[-_NAMED:]]
-        others = len(awaited) - len(names)
-        who = ", ".join(names) + (f" and {others} more" if others else "")
-        who = f"job{'s' if len(awaited) > 1 else ''} {who}"
+        who = f"job{'s' if len(awaited) > 1 else ''} {enumerated(names, len(awaited))}"
         if preempted:
             return f"{who}, preempted for it, to stop"
         if all(each.ending for each in awaited):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import reprlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 _NAMES = {"int": "an integer", "float": "a number", "string": "a string", "bool": "true or false"}
@@ -17,6 +17,9 @@ OF_PLUGIN = "if a plug-in provides it, install the plug-in's package"
 """What to do where a name is unknown that a plug-in may bring: a task, a command, a section of a job."""
 
 Path = tuple[str | int, ...]
+
+_MOST_PLACES = 5
+"""Further wrong places that an error names."""
 
 
 class Refused(ValueError):
@@ -86,18 +89,17 @@ def nearest(name: object, known: Iterable[str], otherwise: str = "", cutoff: flo
     return f"did you mean {near[0]}?" if near else otherwise or f"available: {', '.join(names) or 'none'}"
 
 
-_MOST_PLACES = 5
+def enumerated(first: Sequence[str], total: int) -> str:
+    """The first of ``total`` names for a sentence, and how many more there are: ``a, b and 4 more``."""
+    more = total - len(first)
+    return ", ".join(first) + (f" and {more} more" if more > 0 else "")
 
 
 def other_places(places: Iterable[Path], named: Path) -> str:
     """The further places that are wrong, as the end of a sentence about the ``named`` one; empty where there are none."""
-    others = dict.fromkeys(".".join(map(str, place)) for place in places if place != named)
-    more = f" and {len(others) - _MOST_PLACES} more" if len(others) > _MOST_PLACES else ""
-    return (
-        f" (also wrong or missing: {', '.join(each[:60] for each in list(others)[:_MOST_PLACES])}{more})"
-        if others
-        else ""
-    )
+    others = list(dict.fromkeys(".".join(map(str, place)) for place in places if place != named))
+    first = [each[:60] for each in others[:_MOST_PLACES]]
+    return f" (also wrong or missing: {enumerated(first, len(others))})" if others else ""
 
 
 def unknown_iteration(run: str, iteration: object, known: Iterable[object]) -> str:

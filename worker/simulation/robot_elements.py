@@ -11,6 +11,8 @@ import newton
 import numpy as np
 from newton.solvers import SolverMuJoCo
 
+from shared_store.contract.error_text import enumerated
+
 CARRIER = "__carries_joint_"
 """Part of the name of a body that only carries a joint: MuJoCo lets several joints stand between a body and its parent, each at another place.
 Newton has one joint for each body, so all but the last of them move a body without mass."""
@@ -130,8 +132,8 @@ def paired(in_file: dict[int, str], here: dict[int, str]) -> Pairs:
 
 
 def some(names: list[str]) -> str:
-    """The first names, for a sentence."""
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+    """The first three names, for a sentence."""
+    return enumerated(names[:3], len(names))
 
 
 def actuator_ends(model: Any, actuator: int) -> Ends:

@@ -38,7 +38,7 @@ class AwsConfig(BaseModel):
     max_vcpus: int = Field(default=256, ge=1)
     """vCPUs to which the compute environment may grow, until AWS has answered."""
     poll: float = Field(default=2.0, gt=0)
-    """Seconds between two polls of a gang, and at its logs."""
+    """Seconds between two polls of a gang and its logs."""
     quiet: float = Field(default=6.0, ge=0)
     """Seconds without a line after a node's end, after which its log is whole: AWS's log driver sends every five."""
     endpoint_url: str | None = None
