@@ -17,6 +17,7 @@ from orchestrator.engines.ray.engine import RayEngine
 from orchestrator.engines.ray.folder import Folder
 from orchestrator.engines.toolkit.statuses import status_of
 from shared_store import __version__
+from shared_store.volume.epoch import raise_epoch
 from shared_store.volume.node_outcomes import read_outcome
 from tests.conftest import wait_for
 from tests.support.engines.ray_bench import RayBench
@@ -34,6 +35,13 @@ def bench(ray_cluster: RayCluster, tmp_path: Path) -> Iterator[RayBench]:
 
 def addresses(bench: RayBench) -> dict[str, str]:
     return {node["name"]: node["address"] for node in bench.engine._watch.seen["nodes"]}
+
+
+def drain(bench: RayBench, node: str) -> None:
+    """Announce that the machine with that id goes away in a minute."""
+    notice = ["--reason=DRAIN_NODE_REASON_PREEMPTION", "--reason-message=spot", "--deadline-remaining-seconds=60"]
+    command = [RAY, "drain-node", f"--address={bench.cluster.address}", f"--node-id={node}", *notice]
+    subprocess.run(command, check=True, capture_output=True)
 
 
 def test_hosts_are_the_nodes_that_have_cpus(bench: RayBench) -> None:
@@ -202,15 +210,32 @@ def test_a_machine_that_is_lost_is_noticed_and_no_host_any_more(bench: RayBench)
 def test_a_node_that_has_to_leave_has_the_gang_save_and_leave(bench: RayBench) -> None:
     [node] = [node["id"] for node in bench.engine._watch.seen["nodes"] if node["name"] == "n2"]
     handle = bench.ready(bench.gang(POLITE, 2))
-    notice = ["--reason=DRAIN_NODE_REASON_PREEMPTION", "--reason-message=spot", "--deadline-remaining-seconds=60"]
-    command = [RAY, "drain-node", f"--address={bench.cluster.address}", f"--node-id={node}", *notice]
-    subprocess.run(command, check=True, capture_output=True)
+    drain(bench, node)
     assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
     assert bench.log().count("saved") == 2
     wait_for(lambda: len(bench.engine.capacity().machines) == 2, 20, "no more a host")
     bench.cluster.kill("n2")
     bench.cluster.add("n2")
     wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "its successor is one")
+
+
+def test_the_next_attempt_does_not_go_to_a_machine_that_has_to_leave(bench: RayBench) -> None:
+    [node] = [node["id"] for node in bench.engine._watch.seen["nodes"] if node["name"] == "n2"]
+    at = addresses(bench)
+    handle = bench.ready(bench.gang(POLITE, 2))
+    following = bench.gang(POLITE, 2, attempt=2)
+    plan = bench.engine.plan(following)  # before it is known that the machine leaves
+    drain(bench, node)
+    assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
+    raise_epoch(bench.store.run(following.run), following.epoch)
+    second = bench.engine.launch(plan)
+    bench.handles.append(second)
+    wait_for(lambda: status_of(bench.engine, second) and bench.log(2).count("ready") == 2, 30, "it starts elsewhere")
+    assert {node.address for node in status_of(bench.engine, second)} == {at["n1"], at["n3"]}
+    bench.stopped(second)
+    bench.cluster.kill("n2")
+    bench.cluster.add("n2")
+    wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "its successor is a host")
 
 
 def test_a_driver_that_has_to_end_has_its_gang_save_and_leaves_one_that_waits_to_the_next_driver(

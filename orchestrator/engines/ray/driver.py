@@ -97,9 +97,12 @@ class Driver:
 
     def _place(self, gang: DrivenGang) -> None:
         """Keep the placement group of the attempt before where it fits, else ask for another."""
-        nodes = gang.plan["nodes"]
+        nodes, staying = gang.plan["nodes"], self._staying()
+        for node in nodes:  # one that left since the plan was made, or has to: any other that has room will do
+            if node["pin"] not in staying:
+                node["pin"] = None
         key = [bundle_of(node) for node in nodes], [node["pin"] for node in nodes]
-        if self.group is not None and (key != self.key or not self.group.wait(0.5)):
+        if self.group is not None and (key != self.key or not self.group.wait(0.5) or not self._places() <= staying):
             self._let_go()
         if self.group is None:
             # names have to be unique, and a dead driver's group stays until Ray has noticed its death
@@ -108,6 +111,14 @@ class Driver:
             self.group = ray.util.placement_group(key[0], STRATEGY, name, bundle_label_selector=selectors)
             self.key = key
         gang.phase, gang.why = "placing", "waits for its placement group"
+
+    def _staying(self) -> set[str]:
+        """Ids of the machines that are there, and that nobody asked to leave."""
+        return {node["NodeID"] for node in ray.nodes() if node["Alive"]} - self._draining
+
+    def _places(self) -> set[str]:
+        """Ids of the machines of the placement group, which has its room."""
+        return set(ray.util.placement_group_table(self.group)["bundles_to_node_id"].values())
 
     def _let_go(self) -> None:
         ray.util.remove_placement_group(self.group)
@@ -121,10 +132,7 @@ class Driver:
             gang.place(self.group)
         elif time.monotonic() > self._next_check:
             self._next_check = time.monotonic() + 1.0
-            alive = {node["NodeID"] for node in ray.nodes() if node["Alive"]}
-            if gone := [node for node in gang.plan["nodes"] if node["pin"] and node["pin"] not in alive]:
-                for node in gone:  # any other machine that has room will do
-                    node["pin"] = None
+            if not {node["pin"] for node in gang.plan["nodes"] if node["pin"]} <= self._staying():
                 self._place(gang)
             gang.why = _why_waiting(gang.plan["nodes"])
 
