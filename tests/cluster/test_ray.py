@@ -222,17 +222,23 @@ def test_a_node_that_has_to_leave_has_the_gang_save_and_leave(bench: RayBench) -
 def test_the_next_attempt_does_not_go_to_a_machine_that_has_to_leave(bench: RayBench) -> None:
     [node] = [node["id"] for node in bench.engine._watch.seen["nodes"] if node["name"] == "n2"]
     at = addresses(bench)
+    other = bench.ready(
+        bench.gang(STUBBORN, hosts=("n2",), suffix="-other", run="other")
+    )  # the machine stays for its sake
     handle = bench.ready(bench.gang(POLITE, 2))
     following = bench.gang(POLITE, 2, attempt=2)
     plan = bench.engine.plan(following)  # before it is known that the machine leaves
     drain(bench, node)
     assert [node.exit_code for node in bench.ended(handle)] == [75, 75]
+    bench.engine.stop(handle, 5.0)  # its driver keeps the place
     raise_epoch(bench.store.run(following.run), following.epoch)
     second = bench.engine.launch(plan)
     bench.handles.append(second)
     wait_for(lambda: status_of(bench.engine, second) and bench.log(2).count("ready") == 2, 30, "it starts elsewhere")
     assert {node.address for node in status_of(bench.engine, second)} == {at["n1"], at["n3"]}
-    bench.stopped(second)
+    assert status_of(bench.engine, other)[0].running, "it did not wait for the machine's end"
+    for each in (second, other):
+        bench.engine.stop(each, 0.5)
     bench.cluster.kill("n2")
     bench.cluster.add("n2")
     wait_for(lambda: len(bench.engine.capacity().machines) == 3, 20, "its successor is a host")
