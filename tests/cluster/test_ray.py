@@ -222,9 +222,8 @@ def test_a_node_that_has_to_leave_has_the_gang_save_and_leave(bench: RayBench) -
 def test_the_next_attempt_does_not_go_to_a_machine_that_has_to_leave(bench: RayBench) -> None:
     [node] = [node["id"] for node in bench.engine._watch.seen["nodes"] if node["name"] == "n2"]
     at = addresses(bench)
-    other = bench.ready(
-        bench.gang(STUBBORN, hosts=("n2",), suffix="-other", run="other")
-    )  # the machine stays for its sake
+    # a machine that drains stays until its last job has ended
+    other = bench.ready(bench.gang(STUBBORN, hosts=("n2",), suffix="-other", run="other"))
     handle = bench.ready(bench.gang(POLITE, 2))
     following = bench.gang(POLITE, 2, attempt=2)
     plan = bench.engine.plan(following)  # before it is known that the machine leaves

@@ -98,11 +98,13 @@ class Driver:
     def _place(self, gang: DrivenGang) -> None:
         """Keep the placement group of the attempt before where it fits, else ask for another."""
         nodes, staying = gang.plan["nodes"], self._staying()
-        for node in nodes:  # one that left since the plan was made, or has to: any other that has room will do
-            if node["pin"] not in staying:
+        for node in nodes:
+            if node["pin"] not in staying:  # it has left or is draining; any other machine with room will do
                 node["pin"] = None
         key = [bundle_of(node) for node in nodes], [node["pin"] for node in nodes]
-        if self.group is not None and (key != self.key or not self.group.wait(0.5) or not self._places() <= staying):
+        if self.group is not None and (
+            key != self.key or not self.group.wait(0.5) or not staying.issuperset(self._where())
+        ):
             self._let_go()
         if self.group is None:
             # names have to be unique, and a dead driver's group stays until Ray has noticed its death
@@ -113,12 +115,13 @@ class Driver:
         gang.phase, gang.why = "placing", "waits for its placement group"
 
     def _staying(self) -> set[str]:
-        """Ids of the machines that are there, and that nobody asked to leave."""
+        """Ids of the machines that are alive and not draining."""
         return {node["NodeID"] for node in ray.nodes() if node["Alive"]} - self._draining
 
-    def _places(self) -> set[str]:
-        """Ids of the machines of the placement group, which has its room."""
-        return set(ray.util.placement_group_table(self.group)["bundles_to_node_id"].values())
+    def _where(self) -> list[str]:
+        """Id of the machine of each bundle; the placement group has its room."""
+        where = ray.util.placement_group_table(self.group)["bundles_to_node_id"]
+        return [machine for _, machine in sorted(where.items())]
 
     def _let_go(self) -> None:
         ray.util.remove_placement_group(self.group)
@@ -126,9 +129,8 @@ class Driver:
 
     def _await_place(self, gang: DrivenGang) -> None:
         if self.group.wait(0.1):
-            where = ray.util.placement_group_table(self.group)["bundles_to_node_id"]
-            for index, node in enumerate(gang.nodes):
-                node["ray_node"] = where[index]
+            for node, machine in zip(gang.nodes, self._where(), strict=True):
+                node["ray_node"] = machine
             gang.place(self.group)
         elif time.monotonic() > self._next_check:
             self._next_check = time.monotonic() + 1.0
