@@ -75,7 +75,7 @@ def save(order: dict[str, Any], orders: Orders) -> dict[str, Any]:
         digests = {
             name: _write(writer.path / name, order["memory"], start, size) for name, start, size in order["files"]
         }
-        write_json(writer.path / f".rank-{order['rank']}.json", digests, parents=False)
+        write_json(writer.path / f".rank-{order['rank']}.json", digests, levels=0)
         if order["facts"] is None:
             return {"written": writer.name, "seconds": time.monotonic() - started}
         for rank in range(order["ranks"]):

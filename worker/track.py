@@ -58,7 +58,7 @@ class SenderLock:
         """Take it, unless it is taken already; returns the process that has it, None for this one. Raises OSError."""
         if self._file is not None:
             return None
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        self._path.parent.mkdir(exist_ok=True)
         file = os.open(self._path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o666)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

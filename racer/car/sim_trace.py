@@ -97,5 +97,4 @@ def write_documents(folder: Path, documents: Mapping[str, Mapping[str, Any]]) ->
     """Write :func:`model_documents` below ``folder``. Raises OSError, and DamagedFile if a link is in the place of a directory."""
     for name, document in documents.items():
         refuse_links((folder / name).parent, 1)
-        (folder / name).parent.mkdir(parents=True, exist_ok=True)
         write_json(folder / name, document)

@@ -21,7 +21,7 @@ from racer.car.sim_trace import CONTINUOUS, SIM_TRACE_COLUMNS, sim_trace, write_
 from racer.car.trace import COLUMNS, trace_car
 from racer.store.races import SIM_TRACE
 from shared_store.volume.checkpoints import list_checkpoints
-from shared_store.volume.files import write_atomic
+from shared_store.volume.files import make_directory, write_atomic
 from shared_store.volume.layout import Run
 from worker.simulation.capture import on_torch_stream
 from worker.simulation.episodes import EpisodeArrays
@@ -111,7 +111,7 @@ class TrainingTrace:
         self._clocks: list[list[float]] = [[] for _ in range(cars)]
         self._started = False
         """Whether there is a file of an episode that ended."""
-        self._folder.mkdir(parents=True, exist_ok=True)
+        make_directory(self._folder, 4)
         self._unfinished.mkdir(exist_ok=True)
         if iteration:
             self._load(iteration)

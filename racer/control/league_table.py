@@ -12,7 +12,7 @@ from orchestrator.cli.listings import Resource
 from orchestrator.domain.errors import UsageError
 from racer.store.races import clock
 from racer.store.standings import Row
-from shared_store.volume.files import write_atomic
+from shared_store.volume.files import EVERY_LEVEL, write_atomic
 
 
 def _status(row: Mapping[str, Any]) -> str:
@@ -40,7 +40,8 @@ TABLE = Resource(
 def write(league: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Write the table to ``path``, a .csv (times in seconds) or a .png. Raises UsageError if it can't."""
     try:
-        write_atomic(path.absolute(), _csv(rows) if path.suffix == ".csv" else _picture(league, rows))
+        content = _csv(rows) if path.suffix == ".csv" else _picture(league, rows)
+        write_atomic(path.absolute(), content, levels=EVERY_LEVEL)
     except ImportError:
         raise UsageError(
             f"-o {path}: a picture needs matplotlib, which this environment lacks: pip install 'muster[plot]'; .csv needs nothing"

@@ -15,7 +15,7 @@ import warp as wp
 from racer.car.sim_trace import CONTINUOUS, SIM_TRACE_COLUMNS, model_documents, sim_trace, write_documents
 from racer.car.trace import COLUMNS
 from racer.store.races import SIM_TRACE, rules_of
-from shared_store.volume.files import write_atomic
+from shared_store.volume.files import make_directory, write_atomic
 from worker.simulation.capture import on_torch_stream
 
 if TYPE_CHECKING:
@@ -128,7 +128,7 @@ class RaceTrials:
         Raises OSError.
         """
         folder = evaluation / SIM_TRACE / "evaluation" / evaluation.name / "evaluation-simtrace"
-        folder.mkdir(parents=True, exist_ok=True)
+        make_directory(folder, 6)
         for episode, trial in enumerate(self.trials):
             text = "\n".join(trial.sim_trace(episode)) + "\n"
             write_atomic(folder / f"{episode}-iteration.csv", text.encode())

@@ -16,7 +16,7 @@ from racer.tracks.naming import keep, resolve
 from racer.tracks.presets import PRESETS, make_preset
 from racer.tracks.race_track import Track
 from racer.tracks.route_file import read_file, to_bytes
-from shared_store.volume.files import write_atomic
+from shared_store.volume.files import EVERY_LEVEL, write_atomic
 from shared_store.volume.layout import Store
 from worker.settings.errors import UserError
 
@@ -108,7 +108,7 @@ def _content(order: Order, track: Track) -> bytes:
 def _write(order: Order, content: bytes) -> None:
     if order.get("output"):
         try:
-            write_atomic(Path(order["output"]), content)
+            write_atomic(Path(order["output"]), content, levels=EVERY_LEVEL)
         except OSError as error:
             raise UserError(f"-o {order['output']}: it can't be written ({error.strerror or error})") from None
 

@@ -20,17 +20,19 @@ from typing import Any
 from shared_store.contract.documents import DocumentError
 from shared_store.contract.policy import Contract, read
 from shared_store.volume import files
-from shared_store.volume.files import MANIFEST as MANIFEST
 from shared_store.volume.files import (
+    EVERY_LEVEL,
     DamagedFile,
     copy_file,
     difference_of,
     json_bytes,
+    make_directory,
     manifest_entry,
     sync_directory,
     sync_file,
     write_json,
 )
+from shared_store.volume.files import MANIFEST as MANIFEST
 from shared_store.volume.files import hidden_folder as hidden_folder
 from shared_store.volume.files import publish as publish
 
@@ -133,7 +135,8 @@ def copy(bundle: Path, target: Path, overwrite: bool = False) -> None:
     target = Path(os.path.realpath(target))
     if os.path.lexists(target) and not overwrite:
         raise FileExistsError(errno.EEXIST, "exists already", str(target))
-    with hidden_folder(target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.tmp") as hidden:
+    place = target.parent / f".{target.name}.{uuid.uuid4().hex[:8]}.tmp"
+    with hidden_folder(place, levels=EVERY_LEVEL) as hidden:
         copy_files(bundle, hidden)
         if not os.path.lexists(target):
             publish(hidden, target)
@@ -151,7 +154,7 @@ def copy(bundle: Path, target: Path, overwrite: bool = False) -> None:
 def copy_files(bundle: Path, hidden: Path) -> None:
     """Copy a bundle durably into the directory ``hidden``, and verify the copy. Raises as :func:`copy`."""
     for path in (*verify(bundle)["files"], MANIFEST):
-        (hidden / path).parent.mkdir(parents=True, exist_ok=True)
+        make_directory((hidden / path).parent, len(Path(path).parts))
         copy_file(bundle / path, hidden / path)
     _sync_folders(hidden)
     verify(hidden)

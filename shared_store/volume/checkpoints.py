@@ -245,7 +245,7 @@ class CheckpointWriter:
                 retain(self.run, keep)
             # every rank's writer takes its saves in order: no rank still works on an earlier, failed one
             sweep(self.run, up_to=(self.epoch, self.iteration))
-            write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode(), parents=False)
+            write_atomic(self.run.checkpoints / "LATEST", f"{self.name}\n".encode(), levels=0)
         return Checkpoint(target, self.iteration, self.epoch)
 
     def _write_manifest(self, facts: Mapping[str, Any], digests: Mapping[str, Any] | None) -> None:
@@ -262,7 +262,7 @@ class CheckpointWriter:
             "created": time.time(),
             "files": files,
         }
-        write_json(self.path / MANIFEST, {**facts, **manifest}, parents=False)
+        write_json(self.path / MANIFEST, {**facts, **manifest}, levels=0)
 
 
 def retain(run: Run, keep: int) -> list[str]:

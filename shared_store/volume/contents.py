@@ -81,7 +81,7 @@ def is_archived(run: Run) -> bool:
 def archive(run: Run, by: str) -> None:
     """Archive a run that exists. Raises OSError, DamagedFile for a link in its place."""
     run.check_links()
-    write_json(run.path / ARCHIVED, {"by": by, "at": time.time()}, parents=False)
+    write_json(run.path / ARCHIVED, {"by": by, "at": time.time()}, levels=0)
 
 
 def unarchive(run: Run) -> None:

@@ -15,7 +15,14 @@ import socket
 import time
 from dataclasses import asdict, dataclass
 
-from shared_store.volume.files import open_regular, read_json, refuse_links, sync_directory, write_atomic
+from shared_store.volume.files import (
+    make_directory,
+    open_regular,
+    read_json,
+    refuse_links,
+    sync_directory,
+    write_atomic,
+)
 from shared_store.volume.layout import Run, StoreError
 
 LARGEST_EPOCH = 10**15 - 1
@@ -148,7 +155,7 @@ def _create(run: Run, epoch: int, claim: Claim | None) -> bool:
     if epoch > LARGEST_EPOCH:
         raise ValueError(f"{run.path / 'EPOCH'}: no epoch is left after {LARGEST_EPOCH}")
     refuse_links(run.path, 1)
-    run.path.mkdir(parents=True, exist_ok=True)
+    make_directory(run.path, 2)
     try:
         descriptor = os.open(run.path / f"EPOCH.{epoch}", os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o666)
     except FileExistsError:
@@ -176,7 +183,7 @@ def _await_publication(run: Run, epoch: int, claim: Claim) -> None:
 def _publish(run: Run, epoch: int) -> None:
     if (current := read_epoch(run)) >= epoch:
         raise _stale(run, epoch, current)
-    write_atomic(run.path / "EPOCH", f"{epoch}\n".encode())
+    write_atomic(run.path / "EPOCH", f"{epoch}\n".encode(), levels=0)
     for name in os.listdir(run.path):
         claim = re.fullmatch(r"EPOCH\.([0-9]{1,15})", name)
         if claim and int(claim[1]) < epoch - _KEPT:

@@ -29,6 +29,8 @@ DEEPEST_JSON = 100
 """Levels of lists and objects in a JSON file."""
 LONGEST_WHOLE = 1000
 """Bits of a whole number in a JSON file."""
+EVERY_LEVEL = 1 << 20
+"""For a file outside the store: all directories above it are made that are missing."""
 _INSIDE = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -50,18 +52,32 @@ def sync_directory(path: Path) -> None:
     sync_file(path, os.O_RDONLY | os.O_DIRECTORY)
 
 
-def write_atomic(path: Path, data: bytes, mode: int = 0o666, *, parents: bool = True) -> None:
+def make_directory(path: Path, levels: int = 1) -> None:
+    """Make directory ``path`` where it is missing, and up to ``levels - 1`` of those above it.
+
+    What is above them must exist: where a volume is gone, it would be made in the mount point, and vanish when the volume is back.
+    Raises OSError, FileNotFoundError where more is missing.
+    """
+    try:
+        path.mkdir(exist_ok=True)
+    except FileNotFoundError:
+        if levels <= 1:
+            raise
+        make_directory(path.parent, levels - 1)
+        path.mkdir(exist_ok=True)
+
+
+def write_atomic(path: Path, data: bytes, mode: int = 0o666, *, levels: int = 1) -> None:
     """Replace ``path`` with ``data`` atomically. Raises OSError; a failed write leaves no file behind.
 
     Args:
         path: The file.
         data: Its content.
         mode: Permissions, less the umask, from the first instant; 0o600 for secrets.
-        parents: Make the directories that are missing. False for files of a run that exists: where its volume is gone, they would be
-            made in its mount point, and vanish when it is back.
+        levels: Directories above the file that are made where they are missing, as :func:`make_directory` does; 0: none.
     """
-    if parents:
-        path.parent.mkdir(parents=True, exist_ok=True)
+    if levels:
+        make_directory(path.parent, levels)
     hidden = path.parent / f".{path.name}.{uuid.uuid4().hex[:8]}.tmp"
     try:
         with open(hidden, "wb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
@@ -75,9 +91,9 @@ def write_atomic(path: Path, data: bytes, mode: int = 0o666, *, parents: bool = 
     sync_directory(path.parent)
 
 
-def write_json(path: Path, value: Mapping[str, Any], mode: int = 0o666, *, parents: bool = True) -> None:
+def write_json(path: Path, value: Mapping[str, Any], mode: int = 0o666, *, levels: int = 1) -> None:
     """:func:`write_atomic` for a JSON document."""
-    write_atomic(path, json_bytes(value), mode, parents=parents)
+    write_atomic(path, json_bytes(value), mode, levels=levels)
 
 
 def json_bytes(value: Mapping[str, Any]) -> bytes:
@@ -207,17 +223,18 @@ _in_progress: set[Path] = set()
 
 
 @contextmanager
-def hidden_folder(path: Path, leftovers: Iterable[Path] = ()) -> Iterator[Path]:
+def hidden_folder(path: Path, leftovers: Iterable[Path] = (), *, levels: int = 1) -> Iterator[Path]:
     """A new directory ``path``, with a hidden name, for content that :func:`publish` shows at once; deleted unless that has renamed it.
 
     ``leftovers``: directories of the same owner; those that no other context of this process has are of killed processes, and are deleted.
+    ``levels``: directories above ``path`` that are made where they are missing.
     """
     _in_progress.add(path)
     try:
         for each in leftovers:
             if each not in _in_progress and not each.parent.is_symlink():
                 shutil.rmtree(each, ignore_errors=True)
-        path.mkdir(parents=True)
+        make_directory(path, levels + 1)
         yield path
     finally:
         shutil.rmtree(path, ignore_errors=True)

@@ -25,6 +25,7 @@ from shared_store.volume.files import (
     copy_file,
     difference_of,
     hidden_folder,
+    make_directory,
     rename_new,
     sync_directory,
     write_json,
@@ -84,7 +85,7 @@ class WeightsCopy:
             leftovers = (self._store.path / "runs").glob(f".{self._owner}.*.clone")
             self._folder.enter_context(hidden_folder(self.hidden, leftovers))
             target = self.hidden / place / self.source.name
-            target.mkdir(parents=True)
+            make_directory(target, 2)
             entry = manifest["files"][WEIGHTS]
             try:
                 copy_file(self.source.path / WEIGHTS, target / WEIGHTS)
@@ -160,7 +161,7 @@ class TeacherCopy(WeightsCopy):
             place = existing.teacher(self.teacher).checkpoints
             target = place / self.source.name
             if not target.exists():
-                place.mkdir(parents=True, exist_ok=True)
+                make_directory(place, 4)
                 os.rename(self.hidden / "teacher" / self.source.name, target)
                 self._published = target
                 for each in (place, *place.parents[:4]):

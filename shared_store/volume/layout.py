@@ -114,7 +114,7 @@ class Run:
         """Write ``run.json`` once; an existing run keeps its own. Raises as :meth:`check_links`, OSError."""
         self.check_links()
         if not (self.path / "run.json").exists():
-            write_json(self.path / "run.json", description)
+            write_json(self.path / "run.json", description, levels=2)
 
 
 def check_name(what: str, name: str, error: Callable[[str], Exception]) -> None:
@@ -217,7 +217,7 @@ class Store:
         else:  # who made it died before it wrote
             named = secrets.token_hex(16)
         described = {**description, "id": named}
-        write_json(self.path / "store.json", described)
+        write_json(self.path / "store.json", described, levels=0)
         return described
 
     def run(self, name: str) -> Run:

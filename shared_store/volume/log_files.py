@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shared_store.contract.node import LEAST_LOG_LIMIT, LOG_LIMIT
-from shared_store.volume.files import DamagedFile, open_regular, refuse_links
+from shared_store.volume.files import DamagedFile, make_directory, open_regular, refuse_links
 
 _TAIL = re.compile(r"(node-[0-9]{1,9}\.log)\.([0-9]{15})\.([0-9]{1,15})")
 _HEAD = re.compile(r"node-[0-9]{1,9}\.log")
@@ -234,7 +234,7 @@ class LogWriter:
         self.error: OSError | None = None
         """The reason why the last :meth:`append` did not write everything."""
         refuse_links(path.parent, _LEVELS)
-        path.parent.mkdir(parents=True, exist_ok=True)
+        make_directory(path.parent, _LEVELS - 1)
         self._segments = segments_of(path) or [LogSegment(0, 0, path)]
         self._unchecked, self._interval = 0, 0
         last = self._segments[-1]

@@ -147,7 +147,7 @@ def register(
     folder = store.models / name
     refuse_links(folder, 2)
     hidden = folder / f".{registrar}.{uuid.uuid4().hex}.tmp"
-    with hidden_folder(hidden, store.models.glob(f"*/.{registrar}.*.tmp") if registrar else ()):
+    with hidden_folder(hidden, store.models.glob(f"*/.{registrar}.*.tmp") if registrar else (), levels=2):
         (hidden / "bundle").mkdir()
         bundles.copy_files(bundle, hidden / "bundle")
         lineage = _lineage(run, checkpoint, bundles.read_manifest(hidden / "bundle"))

@@ -79,7 +79,7 @@ def write_outcome(run: Run, job: str, attempt: int, outcome: Outcome) -> None:
     """
     path = run.outcome(job, attempt, outcome.node)
     refuse_links(path.parent, _LEVELS)
-    write_json(path, asdict(bounded(outcome)))
+    write_json(path, asdict(bounded(outcome)), levels=_LEVELS - 1)
 
 
 def read_outcome(run: Run, job: str, attempt: int, node: int) -> Outcome | None:

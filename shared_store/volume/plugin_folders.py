@@ -17,7 +17,7 @@ def note_plugins(store: Store) -> None:
     noted = read_json(store.path / _FILE) or {}
     existing = noted | {name: list(plugin.folders) for name, plugin in plugins().items() if plugin.folders}
     if existing != noted:
-        write_json(store.path / _FILE, existing)
+        write_json(store.path / _FILE, existing, levels=0)
 
 
 def orphans(store: Store) -> Iterator[str]:

@@ -122,7 +122,7 @@ def resolved_spec(spec: Mapping[str, Any], *directories: Path) -> dict[str, Any]
 def keep(directory: Path, data: bytes) -> str:
     """Keep a text under its digest, which is returned; one that is there already is written again. Raises OSError, such as for a full volume."""
     digest = hashlib.sha256(data).hexdigest()
-    write_atomic(directory / digest, data)
+    write_atomic(directory / digest, data, levels=2)
     return digest
 
 

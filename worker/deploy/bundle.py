@@ -40,7 +40,7 @@ from shared_store.contract.plugins import blamed, load, plugins
 from shared_store.contract.policy import Contract
 from shared_store.volume.bundles import CONTRACT, MANIFEST, REPORT, publish, seal
 from shared_store.volume.checkpoints import Checkpoint
-from shared_store.volume.files import remove_tree, write_json
+from shared_store.volume.files import make_directory, remove_tree, write_json
 from shared_store.volume.layout import Run
 from worker.deploy import parity
 from worker.deploy.model_file import (
@@ -179,7 +179,7 @@ def _publish(
     hidden = run.exports / f".{checkpoint.name}.{uuid.uuid4().hex[:8]}.tmp"
     facts = checkpoint.manifest
     try:
-        hidden.mkdir(parents=True)
+        make_directory(hidden, 2)
         for name, data in files.items():
             (hidden / name).write_bytes(data)
         (hidden / LEAPP).write_text(leapp_description(files["policy.onnx"], contract))

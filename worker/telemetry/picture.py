@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
 
-from shared_store.volume.files import write_atomic
+from shared_store.volume.files import EVERY_LEVEL, write_atomic
 from worker.settings.errors import UserError
 from worker.simulation.rendering import look
 from worker.simulation.structs import numbers
@@ -210,6 +210,6 @@ def pace(control_hz: float, ending: str) -> tuple[int, float]:
 def write(path: Path, data: bytes) -> None:
     """Write a picture as a whole or not at all. Raises UserError."""
     try:
-        write_atomic(path, data)
+        write_atomic(path, data, levels=EVERY_LEVEL)
     except OSError as error:
         raise UserError(f"{path}: it can't be written ({error.strerror or error})") from error

@@ -120,7 +120,7 @@ class WandB(Service):
     def open(self, identity: str | None, fresh: str) -> int:
         self.identity = identity or fresh
         directory = self._tracked.directory
-        directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(exist_ok=True)
         if self._offline:  # a file that a kill has cut lacks what was in memory: the new one has the whole history
             for old in (directory / "wandb").glob(f"offline-run-*-{self.identity}"):
                 remove_tree(old)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from shared_store.volume.comparison import RunGroup
-from shared_store.volume.files import write_atomic
+from shared_store.volume.files import EVERY_LEVEL, write_atomic
 
 Curves = Sequence[tuple[str, Sequence[tuple[float, float, float, int]]]]
 
@@ -32,7 +32,7 @@ def draw(groups: Sequence[RunGroup], path: Path) -> None:
     if not any(curve for _, curve in curves):
         raise ValueError("no episode of these runs has finished yet, so nothing can be drawn")
     content = _table(curves) if path.suffix == ".csv" else _picture(curves, path.suffix[1:])
-    write_atomic(path.absolute(), content)
+    write_atomic(path.absolute(), content, levels=EVERY_LEVEL)
 
 
 def _table(curves: Curves) -> bytes:

@@ -95,7 +95,7 @@ def test_damaged_checkpoints_are_listed_with_their_problem(http: httpx.Client, r
     run = runs / "checkpointed"
     write_json(run / "run.json", {"run": "checkpointed", "spec": SPEC})
     for name, manifest in MANIFESTS.items():
-        write_json(run / "checkpoints" / name / "manifest.json", manifest)
+        write_json(run / "checkpoints" / name / "manifest.json", manifest, levels=2)
     deep = run / "checkpoints" / "00000007-e1" / "manifest.json"
     deep.parent.mkdir()
     deep.write_text('{"files": ' + "[" * 5000 + "]" * 5000 + "}")

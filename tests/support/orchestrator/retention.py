@@ -61,10 +61,10 @@ class World:
             session.merge(RunRecord(name=run, queue="default", owner=values["owner"]))
         if directory:
             place = self.store.run(run)
-            write_json(place.path / "run.json", {"run": run, "spec": None})
+            write_json(place.path / "run.json", {"run": run, "spec": None}, levels=2)
             place.logs(name, 1).mkdir(parents=True)
             place.log(name, 1, 0).write_bytes(b"x" * 1000)
-            write_json(place.outcome(name, 1, 0), {})
+            write_json(place.outcome(name, 1, 0), {}, levels=3)
 
     def change(self, name: str, **values: Any) -> None:
         with self.database.session() as session:

@@ -19,8 +19,8 @@ SETTINGS = {"hidden_sizes": [8], "optimizer": "adam", "activation": "elu", "lear
 
 def add_run(store: Store, name: str, spec: dict[str, Any] | None = SPEC, queue: str = "default") -> None:
     """Run ``name``, without a checkpoint."""
-    path = store.run(name).path
-    write_json(path / "run.json", {"run": name, "created": 1, "spec": spec, "queue": queue, "owner": "ann"})
+    facts = {"run": name, "created": 1, "spec": spec, "queue": queue, "owner": "ann"}
+    write_json(store.run(name).path / "run.json", facts, levels=2)
 
 
 def add_checkpoint(store: Store, name: str, iteration: int, weights: bytes = b"weights", **facts: Any) -> Checkpoint:

@@ -35,7 +35,7 @@ WORLDS = 7
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("gang") / "store"
+    return tmp_path_factory.mktemp("gang")
 
 
 @pytest.fixture(scope="module")

@@ -160,6 +160,7 @@ def test_a_training_answers_a_request_between_two_iterations_and_stops_when_the_
 ) -> None:
     monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     run = Run(tmp_path / "run")
+    run.path.mkdir()
     tap = LiveTap()
     tap.serve(run, task, Gate())
     assert not tap.before_iteration()
@@ -182,6 +183,7 @@ def test_a_request_from_another_machine_is_answered_with_the_reason(
 ) -> None:
     monkeypatch.setattr("worker.telemetry.tap.POLL_SECONDS", 0.05)
     run = Run(tmp_path / "run")
+    run.path.mkdir()
     tap = LiveTap()
     tap.serve(run, task, Gate())
     write_json(request_of(run), {"host": "elsewhere", "process": 1, "worlds": 1})

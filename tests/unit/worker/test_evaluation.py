@@ -140,6 +140,7 @@ def test_a_summary_follows_its_table_and_is_compared_with_the_one_before(
     task: Cartpole, played: Episodes, tmp_path: Path
 ) -> None:
     run = Run(tmp_path / "run")
+    run.path.mkdir()
     first = result_of(task, played, "00000003-e1", 7, 0.0).write(run, "first-job", config={})
     assert "compared" not in first and first["table"] == "00000003-e1-first-jo.parquet"
     fell = played.ends.count("dropped_pole")
@@ -164,6 +165,7 @@ def test_a_summary_follows_its_table_and_is_compared_with_the_one_before(
 
 def test_returns_of_other_rewards_are_not_compared(task: Cartpole, played: Episodes, tmp_path: Path) -> None:
     run, function = Run(tmp_path / "run"), {"reward_function": {"file": "mine.py", "text": "one\ntwo\n"}}
+    run.path.mkdir()
     result_of(task, played, "00000003-e1", 7, 0.0).write(run, "own-job", config={})
     heavier = replace(result_of(task, played, "00000003-e1", 7, 0.0), weights={**task.config.rewards, "fall": -4.0})
     assert "compared" not in heavier.write(run, "heavier", config={"rewards": {"fall": -4.0}})
@@ -178,6 +180,7 @@ def test_an_evaluation_is_compared_with_the_newest_in_the_same_episodes(
     task: Cartpole, played: Episodes, tmp_path: Path
 ) -> None:
     run = Run(tmp_path / "taught")
+    run.path.mkdir()
     summary: dict[str, Any] = {}
     for job, iteration, seed in (("one", 20, 7), ("two", 20, 9), ("three", 40, 7), ("four", 40, 7)):
         summary = result_of(task, played, f"{iteration:08d}-e1", seed, 0.0).write(run, job, config={})
@@ -191,6 +194,7 @@ def test_a_killed_evaluation_leaves_no_partial_table_and_the_next_one_deletes_it
     task: Cartpole, played: Episodes, tmp_path: Path
 ) -> None:
     run = Run(tmp_path / "run")
+    run.path.mkdir()
     run.evaluations.mkdir(parents=True)
     half = run.evaluations / ".00000003-e1-job.parquet.0123abcd.tmp"
     half.write_bytes(b"PAR1")

@@ -82,6 +82,7 @@ def test_the_manifest_has_the_score_and_a_resumed_run_the_same(tmp_path: Path) -
 
 
 def cartpole(store: Path, epoch: int = 1, **train: Any) -> Loop:
+    store.mkdir(exist_ok=True)
     env = training(store, epoch=epoch, task="Cartpole", worlds=16, iterations=2, **train)
     job = Job.from_env(env, "train")
     raise_epoch(job.run, epoch)

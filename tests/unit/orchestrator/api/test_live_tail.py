@@ -40,6 +40,7 @@ class World:
 
     def begin(self, job: str) -> None:
         run = Run(self.directory / "run")
+        run.path.mkdir(exist_ok=True)
         with self.database.session() as session:
             session.add(rows.job(job, status=Status.RUNNING))
         self.writers[job] = LogWriter(run.log(job, 1, 0))

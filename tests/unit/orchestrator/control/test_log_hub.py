@@ -57,6 +57,7 @@ class World:
             job = session.get_one(Job, "job")
             nodes = [Node(index=index, host="localhost") for index in range(2)]
             job.attempts.append(Attempt(number=number, epoch=number, nodes=nodes))
+        self.run.path.mkdir(exist_ok=True)
         for node in range(2):
             self.writers[number, node] = LogWriter(self.run.log("job", number, node))
 

@@ -26,6 +26,7 @@ class Followed:
     """A job of one node that is followed: its log, the messages of its node, and one reader."""
 
     def __init__(self, directory: Path, limit: int = 1 << 30) -> None:
+        directory.mkdir()
         self.run = Run(directory)
         self.path = self.run.log("job", *LOG)
         self.writer = LogWriter(self.path, limit)

@@ -54,6 +54,14 @@ def test_content_is_durable_before_it_gets_its_name_and_the_name_before_the_call
     assert [path for _, path in seen[1:]] == [str(tmp_path / "file"), str(tmp_path)]
 
 
+@pytest.mark.parametrize("levels", [0, 1, 2])
+def test_directories_are_made_up_to_a_level_and_above_it_none(tmp_path: Path, levels: int) -> None:
+    with pytest.raises(FileNotFoundError):
+        write_atomic(tmp_path.joinpath(*"abc"[: levels + 1], "file"), NEW, levels=levels)
+    assert os.listdir(tmp_path) == []
+    write_atomic(tmp_path.joinpath(*"abc"[:levels], "file"), NEW, levels=levels)
+
+
 def test_a_failed_write_leaves_the_old_content_and_no_other_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from shared_store.volume.layout import FORMAT, Store, StoreError
+from shared_store.volume.checkpoints import CheckpointWriter
+from shared_store.volume.contents import archive
+from shared_store.volume.evaluations import keep_for_evaluation
+from shared_store.volume.layout import FORMAT, Run, Store, StoreError
+from shared_store.volume.log_files import LogWriter
+from shared_store.volume.metrics import MetricsWriter
+from shared_store.volume.node_outcomes import Outcome, write_outcome
 
 
 def test_a_new_store_is_made_where_there_was_nothing_and_opened_again_unchanged(tmp_path: Path) -> None:
@@ -70,3 +77,25 @@ def test_runs_keep_their_descriptions_and_are_listed_by_name_only_if_they_were_c
     (tmp_path / "runs" / "empty").mkdir()
     (tmp_path / "runs" / ".probe-1").write_text("")
     assert [run.name for run in store.runs()] == ["a", "b"]
+
+
+DONE = Outcome(0, 1, 0, None, "done", None, 1e9, 1e9)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        lambda run: LogWriter(run.log("job", 1, 0)),
+        lambda run: write_outcome(run, "job", 1, DONE),
+        lambda run: MetricsWriter(run, 1, 0).close(),
+        lambda run: CheckpointWriter(run, 1, 1),
+        lambda run: keep_for_evaluation(run, "00000001-e1"),
+        lambda run: archive(run, "key a"),
+    ],
+)
+def test_nothing_of_a_run_is_made_in_the_mount_point_of_a_volume_that_is_gone(
+    tmp_path: Path, write: Callable[[Run], object]
+) -> None:
+    with pytest.raises(OSError):
+        write(Store(tmp_path).run("ant"))
+    assert os.listdir(tmp_path) == []

@@ -25,7 +25,7 @@ def logged(store: Store, name: str, job: str = "j1") -> Run:
     run = store.run(name)
     run.logs(job, 1).mkdir(parents=True)
     run.log(job, 1, 0).write_bytes(b"line\n" * 100)
-    write_json(run.outcome(job, 1, 0), {})
+    write_json(run.outcome(job, 1, 0), {}, levels=3)
     return run
 
 
@@ -174,7 +174,7 @@ def test_one_thing_that_can_t_be_read_hides_no_other(store: Store) -> None:
         write_json(store.run(name).path / "run.json", {"run": name, "parent": {"run": "source"}})
     write(store.run("pupil").path / "teachers" / "source" / "weights")
     for name in ("ant", "bee"):
-        write_json(store.models / name / "1" / "model.json", {"run": "source"})
+        write_json(store.models / name / "1" / "model.json", {"run": "source"}, levels=3)
     closed = (
         store.models / "ant",
         store.run("hidden").path,
