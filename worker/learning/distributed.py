@@ -23,7 +23,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from worker.learning.deferred_compiler import defer_compiler
+from worker.deferred_imports import defer_imports
 from worker.settings.errors import GangError, UserError
 
 REPORT_SECONDS = 60.0
@@ -207,7 +207,7 @@ def connect(placement: RankPlacement, *, device: str | None = None, report_secon
     Raises:
         GangError: Ranks did not report within ``report_seconds``, or can't reach each other.
     """
-    defer_compiler()  # before anything that would import it
+    defer_imports()
     device = device or placement.device
     if device.startswith("cuda"):
         torch.cuda.set_device(device)

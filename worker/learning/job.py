@@ -24,6 +24,7 @@ from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.volume.epoch import StaleEpoch
 from shared_store.volume.layout import Run, Store, StoreError
 from shared_store.volume.texts import TextError, resolved
+from worker.deferred_imports import defer_imports
 from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.settings.errors import GangError, TrainingError, UserError
 
@@ -204,6 +205,7 @@ def run_command(body: Callable[[], int]) -> None:
     """Run a command and exit with its code: 2 for a user's error, 1 for any other, both reported to the supervisor."""
     # Importing the simulation parses hundreds of kernels; garbage collection would make that 50 % slower.
     gc.disable()
+    defer_imports()
     try:
         code = body()
     except (UserError, StoreError, PluginError) as error:

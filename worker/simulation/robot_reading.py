@@ -23,7 +23,7 @@ from shared_store.contract.policy import RobotModel
 from worker.settings.accepted_changes import CHANGED_ROBOTS
 from worker.simulation import actuators as actuation
 from worker.simulation import robot_comparison as robot_judge
-from worker.simulation import robot_files, robot_mjcf, robot_reference, robot_usd, robot_values
+from worker.simulation import robot_files, robot_mjcf, robot_reference, robot_values
 from worker.simulation.robot_comparison import Comparison, RobotDifference
 from worker.simulation.robot_elements import empty_builder, keep_inertias, short
 from worker.simulation.robot_files import RobotFile
@@ -129,6 +129,8 @@ def read(robot: Robot) -> Reading:
     file, name = robot_files.read(robot.file), shown(robot.file)
     reference, is_readable = None, True
     if file.format == "usd":
+        from worker.simulation import robot_usd  # USD's library takes a while
+
         builder = _imported(robot, file)
         found, corrected = robot_usd.judge(file.source, builder, robot.ignore, name, robot.accept)
         notes = list(found.notes)
@@ -211,6 +213,8 @@ def _imported(robot: Robot, file: RobotFile) -> newton.ModelBuilder:
             elif file.format == "urdf":
                 builder.add_urdf(file.source, floating=floating)
             else:
+                from worker.simulation import robot_usd
+
                 builder.add_usd(
                     file.source,
                     floating=floating,

@@ -1,4 +1,4 @@
-"""What a rank and the command start without: torch's compiler, which is available as soon as something needs it, and Rerun."""
+"""What a rank and the command start without: modules that are there as soon as something needs them."""
 
 from __future__ import annotations
 
@@ -10,26 +10,48 @@ from tests.support.worker.ranks import ROOT
 
 SCRIPT = """
 import sys
+from worker.deferred_imports import DEFERRED, _Deferred, _StandIn, defer_imports
+defer_imports()
 from worker.learning.distributed import RankPlacement, connect
 connect(RankPlacement(), device="cpu")
-import torch, tensordict
+import torch, tensordict, warp
 import worker.learning.loop
+from worker.learning import algorithms
+from worker.tasks import find_task
 weight = torch.ones(3, requires_grad=True)
 adam = torch.optim.Adam([weight], lr=torch.tensor(0.1), fused=True)
 weight.sum().backward()
 adam.step()
 adam.load_state_dict(adam.state_dict())
-assert "torch._dynamo.symbolic_convert" not in sys.modules, "an eager rank needs no compiler"
-import orchestrator.cli, orchestrator.cli.recordings, worker.telemetry.tap, worker.tasks.library.cartpole, newton
+algorithms.find_algorithm("ppo")
+kind = find_task("Cartpole")
+task = kind(kind.config_type(), 2, seed=0, device="cpu")
+task.step(torch.zeros(2, 1))
+import orchestrator.cli, orchestrator.cli.recordings, worker.telemetry.tap
+for name in DEFERRED:
+    assert isinstance(sys.modules.get(name), _Deferred | None), f"a rank needs no {name}"
 assert "rerun" not in sys.modules, "neither the command nor a training needs it"
+for module in warp._src.context.user_modules.values():
+    for function in (each.adj.func for each in (*module.functions.values(), *module.kernels.values())):
+        used = {name: function.__globals__.get(name) for name in function.__code__.co_names}
+        assert not [name for name, value in used.items() if isinstance(value, _StandIn)], (module.name, used)
+
 torch.compile(lambda x: x * 2 + weight[0], backend="eager")(torch.ones(3))
 import torch._dynamo.config
 assert "torch._dynamo.symbolic_convert" in sys.modules
+import newton
+from newton.viewer import ViewerNull
+class Own(ViewerNull):
+    pass
+assert issubclass(Own, newton.viewer.ViewerBase._real())
+assert isinstance(Own(), newton.viewer.ViewerBase) and not isinstance(3, newton.CollisionPipeline)
+import newton._src.usd.utils as usd
+assert callable(usd.get_transform) and usd is sys.modules["newton._src.usd.utils"]
 print("all")
 """
 
 
-def test_compiler_and_rerun_are_left_out_until_they_are_wanted() -> None:
+def test_what_a_rank_does_not_use_is_imported_at_its_first_use() -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT], cwd=ROOT, capture_output=True, text=True, timeout=60 * PATIENCE
     )

@@ -1,0 +1,147 @@
+"""Starting without modules that a rank does not use, although what it imports imports them: they take longer than all others together.
+
+Such a module is imported when one of its names is used. Until then each of its names is a stand-in, which can be called, subclassed
+and tested against. A module whose names stand in Warp kernels or functions does not belong here: Warp reads them as they are.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import types
+from collections.abc import Sequence
+from importlib.machinery import ModuleSpec, PathFinder
+from typing import Any
+
+_COMPILER = "torch._dynamo"
+_SHAPES = "torch._meta_registrations"
+"""Operators on tensors without data, which torch's compiler and exporter alone use."""
+DEFERRED = frozenset(
+    (
+        *(_COMPILER, _SHAPES, "torch.export"),
+        # loggers of rsl_rl's runner, which import those of wandb, neptune and TensorBoard
+        *("rsl_rl.utils.wandb_log_writer", "rsl_rl.utils.neptune_log_writer"),
+        # windows and viewers; with the extra `viz` these import rerun
+        *("glfw", "newton._src.viewer"),
+        # Newton's own collisions and couplings: MuJoCo-Warp does the physics
+        *("newton._src.sim.collide", "newton._src.geometry.narrow_phase", "newton._src.geometry.particle_surface"),
+        "newton._src.geometry.sdf_hydroelastic",
+        *("newton._src.solvers.coupled.solver_coupled", "newton._src.solvers.coupled.solver_coupled_admm"),
+        "newton._src.solvers.coupled.solver_coupled_proxy",
+        # USD files, whose library is large
+        "newton._src.usd.utils",
+    )
+)
+
+
+class _Deferred(types.ModuleType):
+    """A module of which no name was used yet."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # whoever looks through all modules
+            raise AttributeError(name)
+        return _StandIn(self.__name__, name)
+
+
+class _DeferredCompiler(_Deferred):
+    """``torch._dynamo`` as far as eager code needs it: ``import tensordict`` and the first step of any optimizer import it only to name
+    functions that it need not look at. They are passed on when it is imported."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.noted: list[tuple[str, Any]] = []
+
+    def allow_in_graph(self, function: Any) -> Any:
+        self.noted.append(("allow_in_graph", function))
+        return function
+
+    def assume_constant_result(self, function: Any) -> Any:
+        self.noted.append(("assume_constant_result", function))
+        return function
+
+    def disable(self, fn: Any = None, *options: Any, **named: Any) -> Any:
+        return _load(_COMPILER).disable(fn, *options, **named) if fn is None else fn
+
+    def graph_break(self, *options: Any, **named: Any) -> None:
+        """Nothing is being traced."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(_load(_COMPILER), name)
+
+
+class _StandIn:
+    """A name of a deferred module."""
+
+    def __init__(self, module: str, name: str) -> None:
+        self._place = module, name
+
+    def _real(self) -> Any:
+        module, name = self._place
+        return getattr(_load(module), name)
+
+    def __call__(self, *values: Any, **named: Any) -> Any:
+        return self._real()(*values, **named)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._real(), name)
+
+    def __mro_entries__(self, bases: tuple[Any, ...]) -> tuple[Any, ...]:
+        return (self._real(),)
+
+    def __instancecheck__(self, instance: object) -> bool:
+        is_used = not isinstance(sys.modules.get(self._place[0]), _Deferred)
+        return is_used and isinstance(instance, self._real())
+
+
+def _load(name: str) -> Any:
+    """The module itself."""
+    deferred = sys.modules.get(name)
+    if not isinstance(deferred, _Deferred):
+        return importlib.import_module(name)
+    if name == _COMPILER:
+        _load(_SHAPES)
+    _Finder.left.discard(name)
+    del sys.modules[name]
+    module = importlib.import_module(name)
+    for kind, function in vars(deferred).get("noted", ()):
+        getattr(module, kind)(function)
+    return module
+
+
+class _Finder:
+    """Finds the modules that are still to be deferred."""
+
+    left: set[str] = set()
+
+    @classmethod
+    def find_spec(cls, name: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
+        parent = name.rpartition(".")[0]
+        if isinstance(sys.modules.get(parent), _Deferred):
+            _load(parent)
+        elif name not in cls.left:
+            return None
+        spec = PathFinder.find_spec(name, path)
+        if spec is not None and (name in cls.left or name in sys.modules):
+            spec.loader = cls
+        return spec
+
+    @staticmethod
+    def create_module(spec: ModuleSpec) -> types.ModuleType:
+        """A deferred module, or the one that the import of its parent has made."""
+        kind = _DeferredCompiler if spec.name == _COMPILER else _Deferred
+        return sys.modules.get(spec.name) or kind(spec.name)
+
+    @staticmethod
+    def exec_module(module: types.ModuleType) -> None:
+        """It waits for its first use."""
+
+
+def defer_imports() -> None:
+    """Import the modules of :data:`DEFERRED` that are not imported yet when they are first used."""
+    if _Finder not in sys.meta_path:
+        sys.meta_path.insert(0, _Finder)
+    _Finder.left |= DEFERRED - sys.modules.keys()
