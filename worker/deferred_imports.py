@@ -28,10 +28,14 @@ DEFERRED = frozenset(
         "newton._src.geometry.sdf_hydroelastic",
         *("newton._src.solvers.coupled.solver_coupled", "newton._src.solvers.coupled.solver_coupled_admm"),
         "newton._src.solvers.coupled.solver_coupled_proxy",
-        # USD files, whose library is large
-        "newton._src.usd.utils",
+        # USD files, whose library is large, and starts a thread
+        *("newton._src.usd.utils", "newton_usd_schemas"),
     )
 )
+
+
+_FIRST = {_COMPILER: _SHAPES, "pxr.Usd": "newton_usd_schemas"}
+"""Modules that are of no use without another, which has to be imported before them."""
 
 
 class _Deferred(types.ModuleType):
@@ -102,8 +106,8 @@ def _load(name: str) -> Any:
     deferred = sys.modules.get(name)
     if not isinstance(deferred, _Deferred):
         return importlib.import_module(name)
-    if name == _COMPILER:
-        _load(_SHAPES)
+    if first := _FIRST.get(name):
+        _load(first)
     _Finder.left.discard(name)
     del sys.modules[name]
     module = importlib.import_module(name)
@@ -119,19 +123,20 @@ class _Finder:
 
     @classmethod
     def find_spec(cls, name: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
-        parent = name.rpartition(".")[0]
-        if isinstance(sys.modules.get(parent), _Deferred):
-            _load(parent)
-        elif name not in cls.left:
+        is_left = name in cls.left
+        for other in () if is_left else (name.rpartition(".")[0], _FIRST.get(name, "")):
+            if isinstance(sys.modules.get(other), _Deferred):
+                _load(other)
+        if not is_left and name not in sys.modules:
             return None
         spec = PathFinder.find_spec(name, path)
-        if spec is not None and (name in cls.left or name in sys.modules):
-            spec.loader = cls
+        if spec is not None:
+            spec.loader = cls  # type: ignore[assignment]
         return spec
 
     @staticmethod
     def create_module(spec: ModuleSpec) -> types.ModuleType:
-        """A deferred module, or the one that the import of its parent has made."""
+        """A deferred module, or the one that :func:`_load` has just imported."""
         kind = _DeferredCompiler if spec.name == _COMPILER else _Deferred
         return sys.modules.get(spec.name) or kind(spec.name)
 

@@ -26,6 +26,8 @@ SCRATCH = "muster-node-{pid}-"
 _PASSED_ON = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _ORPHANED = signal.SIGUSR1
 """Signal from the kernel to the shim when the process that it is tied to dies."""
+FORKED = "MUSTERFORKED_SUPERVISOR"
+"""Variable with the pid of a supervisor, a child, that is there already (:mod:`shared_store.process.forking`)."""
 _DIGITS = 3
 """Of an exit code."""
 _PR_SET_PDEATHSIG, _PR_SET_NAME, _PR_SET_CHILD_SUBREAPER = 1, 15, 36
@@ -82,9 +84,16 @@ def main(parent: str, group: str, files: str, exit_file: str, *command: str) -> 
             os._exit(1)
     sys.path.append(os.path.abspath(__file__).rsplit("/", 3)[0])
     me = os.getpid()
-    supervisor = os.fork()  # the process has only one thread, so Python may run in the child
-    if not supervisor:
-        _become(me, group, int(files), command)
+    supervisor = int(os.environ.get(FORKED, 0))
+    if supervisor:
+        os.kill(me, signal.SIGCHLD)  # it may have ended before the mask was set
+    else:
+        supervisor = os.fork()  # the process has only one thread, so Python may run in the child
+        if not supervisor:
+            from shared_store.process import tether
+
+            enter(me, group, int(files))
+            tether.become(command)
     code = _wait(supervisor, watched)
     if _has_children() or not _removed(group):
         _end_the_rest(group, lambda: libc.prctl(_PR_SET_NAME, STUCK.encode(), 0, 0, 0))
@@ -103,7 +112,14 @@ def main(parent: str, group: str, files: str, exit_file: str, *command: str) -> 
     os._exit(code)
 
 
-def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:
+def enter(shim: int, group: str, files: int) -> None:
+    """Be the supervisor's process of the node with this shim; what it starts then is in the node's control group.
+
+    Args:
+        shim: Pid of the parent.
+        group: As in :func:`shimmed`.
+        files: As in :func:`shimmed`.
+    """
     import resource
 
     from shared_store.process import tether
@@ -116,7 +132,7 @@ def _become(shim: int, group: str, files: int, command: Sequence[str]) -> None:
             os.mkdir(group)
         except OSError:
             pass  # it exists, or the tether reports that it can't be entered; the shim finds the remaining processes without it
-    tether.main(str(shim), "", group, *command)
+    tether.enter(str(shim), "", group)
 
 
 def _wait(supervisor: int, watched: set[signal.Signals]) -> int:

@@ -59,8 +59,8 @@ def follow(parent: int) -> None:
         os._exit(1)
 
 
-def main(parent: str, ignored: str, group: str, *command: str) -> None:
-    """Become ``command``; if that fails, exit with 127 and one line on standard error."""
+def enter(parent: str, ignored: str, group: str) -> None:
+    """Be tied to ``parent``, in the control group ``group`` if that can be entered, with the signals of :func:`tied`."""
     follow(int(parent))
     if group:
         try:
@@ -71,6 +71,16 @@ def main(parent: str, ignored: str, group: str, *command: str) -> None:
     for number in signal.valid_signals() - {signal.SIGKILL, signal.SIGSTOP}:
         signal.signal(number, signal.SIG_IGN if str(int(number)) in ignored.split(",") else signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_SETMASK, [])
+
+
+def main(parent: str, ignored: str, group: str, *command: str) -> None:
+    """Become ``command``, tied to ``parent``."""
+    enter(parent, ignored, group)
+    become(command)
+
+
+def become(command: Sequence[str]) -> None:
+    """Become ``command``; if that fails, exit with 127 and one line on standard error."""
     try:
         os.execvp(command[0], command)
     except OSError as error:

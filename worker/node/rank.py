@@ -19,9 +19,11 @@ from typing import IO, Any
 
 from shared_store.contract.faults import fault_from, fault_in
 from shared_store.contract.node import NodeContract
+from shared_store.process.forking import module_of
 from shared_store.process.tether import tied
 from shared_store.volume.files import DamagedFile, json_object, read_json
 from shared_store.volume.node_outcomes import FirstError
+from worker.node.forked import ForkedRank
 
 _PR_SET_CHILD_SUBREAPER = 36
 _LONGEST_LINE = 65536
@@ -66,7 +68,7 @@ class Rank:
         """Time of its last message about an iteration (monotonic [s]); None before the first and after the last iteration."""
         self.spoke = time.monotonic()
         """Time of its start or of its last message (monotonic [s])."""
-        self._process: subprocess.Popen[bytes]
+        self._process: subprocess.Popen[bytes] | ForkedRank
         self._directory: Path | None = None
         self._beacon = b""
         self._partial = {"o": b"", "e": b""}
@@ -104,6 +106,7 @@ class Rank:
         directory: Path | None = None,
         prefix: Sequence[str] = (),
         group: str = "",
+        forked: tuple[int, int] | None = None,
     ) -> None:
         """Start ``command`` in a session of its own, tied to this process's life. Raises OSError where it can't be started.
 
@@ -113,6 +116,7 @@ class Rank:
             directory: Its working directory; None: that of this process.
             prefix: A command that becomes ``command``.
             group: Directory of the control group that it enters; empty: none.
+            forked: A process that waits to become it (:func:`worker.node.forked.forked_ranks`).
         """
         program = os.path.join(directory or "", command[0]) if "/" in command[0] else command[0]
         if shutil.which(program, path=env.get("PATH", os.defpath)) is None:
@@ -120,16 +124,20 @@ class Rank:
             raise OSError(problem, os.strerror(problem))
         self.beacon, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._directory = directory
-        self._process = subprocess.Popen(
-            tied([*prefix, *command], group=group),
-            cwd=directory,
-            env={**env, "MUSTER_PROGRESS_FD": str(write_end)},
-            pass_fds=(write_end,),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            start_new_session=True,
-        )
+        module = module_of(command)
+        if forked is not None and module and not prefix:
+            self._process = ForkedRank(*forked, module, env, directory, group, write_end)
+        else:
+            self._process = subprocess.Popen(
+                tied([*prefix, *command], group=group),
+                cwd=directory,
+                env={**env, "MUSTER_PROGRESS_FD": str(write_end)},
+                pass_fds=(write_end,),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,
+            )
         os.close(write_end)
         self.running = True
         for stream in ("o", "e"):

@@ -31,6 +31,7 @@ from shared_store.volume.log_files import LogWriter, left_out
 from shared_store.volume.logs import END_LINE, format_line, format_lines
 from shared_store.volume.node_outcomes import EX_TEMPFAIL, OUT_OF_MEMORY, Outcome, first_cause, write_outcome
 from worker.node.bus import BusCommand, NodeBus
+from worker.node.forked import forked_ranks
 from worker.node.rank import Rank, adopt_orphans, dump_stacks, kill_group, state_of
 from worker.node.surroundings import MemoryLimit, Surroundings, interface_of
 
@@ -147,6 +148,7 @@ class Supervisor:
     # -- ranks --------------------------------------------------------------------------------------------------------
 
     def _start_ranks(self, scratch: Path) -> None:
+        forked = iter(forked_ranks())
         contract, found = self.contract, Surroundings(self.contract, scratch)
         self._kept = found.kept
         threads = max(1, int(contract.cpus / contract.ranks_per_node))
@@ -165,7 +167,14 @@ class Supervisor:
             # what the user set in the job's environment stands; some variables are the supervisor's alone
             own = {name: value for name, value in found.environment.items() if name not in OWN_VARIABLES}
             env = {**shared, **own, **rank.environment()}
-            rank.start(self.command, env, directory=found.directory, prefix=found.prefix, group=self._memory.group)
+            rank.start(
+                self.command,
+                env,
+                directory=found.directory,
+                prefix=found.prefix,
+                group=self._memory.group,
+                forked=next(forked, None),
+            )
             self.ranks.append(rank)
             for stream in ("o", "e"):
                 self.selector.register(rank.pipe(stream), selectors.EVENT_READ, (rank, stream))

@@ -11,5 +11,5 @@ wp.config.enable_backward = False
 # Warp looks through each function for those that it calls, only to unload their callers where a module is imported a second time,
 # as in a notebook. For two thousand functions of Newton and MuJoCo-Warp that is a quarter of their import.
 if hasattr(context.Module, "_find_references"):
-    context.Module._find_references = lambda module, adjoint: None
+    context.Module._find_references = lambda module, adjoint: None  # type: ignore[method-assign]
 defer_imports()

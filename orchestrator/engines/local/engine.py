@@ -16,8 +16,8 @@ import re
 import resource
 import signal
 import subprocess
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,6 +37,7 @@ from orchestrator.engines.api import (
     unused_user,
 )
 from orchestrator.engines.local import TRAITS
+from orchestrator.engines.local.fork_server import ForkServer, prepared
 from orchestrator.engines.local.gangs import parent_of
 from orchestrator.engines.toolkit.environment import inherited, node_environment, supervised
 from orchestrator.engines.toolkit.gpus import visible_gpus
@@ -44,6 +45,7 @@ from orchestrator.engines.toolkit.mounts import mounts_of, with_mounts
 from orchestrator.engines.toolkit.statuses import ended, one_by_one
 from orchestrator.engines.toolkit.waiting import wait_until
 from shared_store.process.cgroups import own_group, remove_abandoned_groups
+from shared_store.process.forking import module_of
 from shared_store.process.memory_groups import memory_group, memory_home
 from shared_store.process.node_processes import NodeProcesses, end_nodes
 from shared_store.process.ports import first_port, free_port
@@ -73,6 +75,8 @@ class NodeProcess:
     group: str
     """Its control group; empty where none can be made."""
     directory: str | None
+    forkable: int
+    """Its ranks, if these may be forked; 0 for programs that have to be started."""
 
 
 class LocalEngine:
@@ -104,6 +108,7 @@ class LocalEngine:
         for directory in {self._groups, self._memory}:
             remove_abandoned_groups(directory)
         self._ended: dict[str, GangStatus] = {}
+        self._fork_server = prepared()
         self._files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         """Limit of open files of what is started: the controller raises its own later, and select() knows no file above 1023."""
 
@@ -138,24 +143,26 @@ class LocalEngine:
         nodes: dict[int, dict[str, object]] = {}
         started: list[int] = []
         try:
-            for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
-                if index in found:
-                    pid, group = found[index].pid, found[index].group
-                elif read_outcome(run, gang.job, gang.attempt, index) is not None:
-                    pid, group = 0, ""
-                else:
-                    group = plan.request[index].group
-                    pid = self._start(plan.request[index], port, gang.name, index, started)
-                process, address = find_process(pid), plan.nodes[index].contract.address
-                start = process.start if process else ""
-                memory = plan.nodes[index].contract.memory_group
-                nodes[index] = {"pid": pid, "start": start, "address": address, "group": group, "memory": memory}
+            with self._forks(plan.request) as forks:
+                for index in sorted(range(len(plan.nodes)), key=lambda index: index != gang.main):
+                    if index in found:
+                        pid, group = found[index].pid, found[index].group
+                    elif read_outcome(run, gang.job, gang.attempt, index) is not None:
+                        pid, group = 0, ""
+                    else:
+                        group = plan.request[index].group
+                        pid = self._start(plan.request[index], port, gang.name, index, started, forks)
+                    process, address = find_process(pid), plan.nodes[index].contract.address
+                    start = process.start if process else ""
+                    memory = plan.nodes[index].contract.memory_group
+                    nodes[index] = {"pid": pid, "start": start, "address": address, "group": group, "memory": memory}
         except BaseException as error:  # never half a gang
             # by its pid: for a moment after it was started a process has no environment yet by which it would be found
             for pid in started:
-                child = self._children.pop(pid)
-                child.kill()
-                child.wait()
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
+                if child := self._children.pop(pid, None):
+                    child.wait()
             try:
                 end_nodes([_processes(node) for node in nodes.values()], [f"MUSTER_GANG={gang.name}"])
                 self._forget(gang.name, list(nodes.values()))
@@ -191,6 +198,22 @@ class LocalEngine:
 
     def close(self) -> None:
         """Supervisors go on."""
+        if self._fork_server is not None:
+            self._fork_server.close()
+
+    @contextmanager
+    def _forks(self, nodes: Sequence[NodeProcess]) -> Iterator[ForkServer | None]:
+        """Where the nodes of a gang can be forked: a server of its own is worth it where several ranks would import the same."""
+        if self._fork_server is not None or sum(node.forkable for node in nodes) < 2:
+            yield self._fork_server
+            return
+        try:
+            server = ForkServer()
+        except OSError:
+            yield None
+            return
+        with closing(server):
+            yield server
 
     def _forget(self, gang: str, nodes: Sequence[Mapping[str, object]]) -> None:
         """Nothing of the gang is left: remove what was kept of its supervisors."""
@@ -212,30 +235,42 @@ class LocalEngine:
         environment = node_environment(own, gpus, node.environment, node.contract.to_env())
         index = node.contract.node_index
         group = f"{self._groups}/{_group_name(gang.name, index)}" if self._groups else ""
-        command = with_mounts(supervised(node.command), mounts_of(gang.nodes[index].container, gang.store))
+        mounts = mounts_of(gang.nodes[index].container, gang.store)
+        command = with_mounts(supervised(node.command), mounts)
+        is_plain = not (mounts or gang.isolated or node.contract.user or node.contract.memory_group)
+        forkable = node.contract.ranks_per_node if is_plain and module_of(node.command) else 0
         exit_file = str(self._left(gang.name, index, "exit"))
         whole = shimmed(command, group, files=self._files, exit_file=exit_file)
-        return NodeProcess(whole, environment, group, gang.directory)
+        return NodeProcess(whole, environment, group, gang.directory, forkable)
 
-    def _start(self, node: NodeProcess, port: int, gang: str, index: int, started: list[int]) -> int:
+    def _start(
+        self, node: NodeProcess, port: int, gang: str, index: int, started: list[int], forks: ForkServer | None
+    ) -> int:
         """``port``: where the gang meets; ``started``: gets the pid as soon as there is one."""
         errors = self._left(gang, index, "err")
         errors.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         make_exit_file(str(self._left(gang, index, "exit")))
+        environment = {**node.environment, "MASTER_PORT": str(port)}
         with open(errors, "ab") as stderr:
-            process = subprocess.Popen(
-                list(node.command),
-                env={**node.environment, "MASTER_PORT": str(port)},
-                cwd=node.directory,
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=stderr,
-                start_new_session=True,
-            )
-        self._children[process.pid] = process
-        started.append(process.pid)
-        await_marks(process.pid)
-        return process.pid
+            pid = 0
+            if forks is not None and node.forkable and forks.fits(environment):
+                with suppress(OSError):  # it has ended
+                    pid = forks.fork(node.command, environment, node.directory, stderr.fileno(), node.forkable)
+            if not pid:
+                process = subprocess.Popen(
+                    list(node.command),
+                    env=environment,
+                    cwd=node.directory,
+                    stdin=subprocess.DEVNULL,
+                    stdout=subprocess.DEVNULL,
+                    stderr=stderr,
+                    start_new_session=True,
+                )
+                pid = process.pid
+                self._children[pid] = process
+        started.append(pid)
+        await_marks(pid)
+        return pid
 
     def _observe_node(self, gang: str, index: int, node: Mapping[str, object]) -> NodeStatus:
         pid, address = int(str(node["pid"])), str(node["address"])
