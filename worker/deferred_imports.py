@@ -14,11 +14,12 @@ from importlib.machinery import ModuleSpec, PathFinder
 from typing import Any
 
 _COMPILER = "torch._dynamo"
-_SHAPES = "torch._meta_registrations"
+_SHAPES = "torch.fx.experimental.symbolic_shapes"
+_META = "torch._meta_registrations"
 """Operators on tensors without data, which torch's compiler and exporter alone use."""
 DEFERRED = frozenset(
     (
-        *(_COMPILER, _SHAPES, "torch.export"),
+        *(_COMPILER, _SHAPES, _META, "torch.export"),
         # loggers of rsl_rl's runner, which import those of wandb, neptune and TensorBoard
         *("rsl_rl.utils.wandb_log_writer", "rsl_rl.utils.neptune_log_writer"),
         # windows and viewers; with the extra `viz` these import rerun
@@ -34,8 +35,8 @@ DEFERRED = frozenset(
 )
 
 
-_FIRST = {_COMPILER: _SHAPES, "pxr.Usd": "newton_usd_schemas"}
-"""Modules that are of no use without another, which has to be imported before them."""
+_FIRST = {_COMPILER: (_META, _SHAPES), "pxr.Usd": ("newton_usd_schemas",)}
+"""Modules that are of no use without others, which have to be imported before them."""
 
 
 class _Deferred(types.ModuleType):
@@ -54,6 +55,7 @@ class _DeferredCompiler(_Deferred):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.noted: list[tuple[str, Any]] = []
+        self.trace_rules = _NoRules()
 
     def allow_in_graph(self, function: Any) -> Any:
         self.noted.append(("allow_in_graph", function))
@@ -73,6 +75,29 @@ class _DeferredCompiler(_Deferred):
         if name.startswith("__"):
             raise AttributeError(name)
         return getattr(_load(_COMPILER), name)
+
+
+class _DeferredShapes(_Deferred):
+    """``torch.fx.experimental.symbolic_shapes`` as far as the backward pass needs it, to compare the shapes of gradients: numbers."""
+
+    def sym_eq(self, first: Any, second: Any) -> Any:
+        are_numbers = all(type(each) is int for shape in (first, second) if isinstance(shape, tuple) for each in shape)
+        if are_numbers and isinstance(first, tuple) and isinstance(second, tuple):
+            return first == second
+        return _load(_SHAPES).sym_eq(first, second)
+
+    def expect_true(self, condition: Any, *options: Any) -> Any:
+        return condition if isinstance(condition, bool) else _load(_SHAPES).expect_true(condition, *options)
+
+
+class _NoRules:
+    """``torch._dynamo.trace_rules`` as far as a process group needs it, which clears them."""
+
+    def clear_lru_cache(self) -> None:
+        """Nothing was traced."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_load(_COMPILER).trace_rules, name)
 
 
 class _StandIn:
@@ -96,9 +121,17 @@ class _StandIn:
     def __mro_entries__(self, bases: tuple[Any, ...]) -> tuple[Any, ...]:
         return (self._real(),)
 
+    def __or__(self, other: Any) -> Any:
+        return self._real() | other
+
+    __ror__ = __or__
+
     def __instancecheck__(self, instance: object) -> bool:
         is_used = not isinstance(sys.modules.get(self._place[0]), _Deferred)
         return is_used and isinstance(instance, self._real())
+
+
+_KINDS: dict[str, type[_Deferred]] = {_COMPILER: _DeferredCompiler, _SHAPES: _DeferredShapes}
 
 
 def _load(name: str) -> Any:
@@ -106,8 +139,8 @@ def _load(name: str) -> Any:
     deferred = sys.modules.get(name)
     if not isinstance(deferred, _Deferred):
         return importlib.import_module(name)
-    if first := _FIRST.get(name):
-        _load(first)
+    for each in _FIRST.get(name, ()):
+        _load(each)
     _Finder.left.discard(name)
     del sys.modules[name]
     module = importlib.import_module(name)
@@ -124,7 +157,7 @@ class _Finder:
     @classmethod
     def find_spec(cls, name: str, path: Sequence[str] | None, target: object = None) -> ModuleSpec | None:
         is_left = name in cls.left
-        for other in () if is_left else (name.rpartition(".")[0], _FIRST.get(name, "")):
+        for other in () if is_left else (name.rpartition(".")[0], *_FIRST.get(name, ())):
             if isinstance(sys.modules.get(other), _Deferred):
                 _load(other)
         if not is_left and name not in sys.modules:
@@ -137,8 +170,7 @@ class _Finder:
     @staticmethod
     def create_module(spec: ModuleSpec) -> types.ModuleType:
         """A deferred module, or the one that :func:`_load` has just imported."""
-        kind = _DeferredCompiler if spec.name == _COMPILER else _Deferred
-        return sys.modules.get(spec.name) or kind(spec.name)
+        return sys.modules.get(spec.name) or _KINDS.get(spec.name, _Deferred)(spec.name)
 
     @staticmethod
     def exec_module(module: types.ModuleType) -> None:

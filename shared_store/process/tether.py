@@ -82,7 +82,7 @@ def main(parent: str, ignored: str, group: str, *command: str) -> None:
 def become(command: Sequence[str]) -> None:
     """Become ``command``; if that fails, exit with 127 and one line on standard error."""
     try:
-        os.execvp(command[0], command)
+        os.execvp(command[0], list(command))
     except OSError as error:
         print(f"can't start {command[0]!r}: {error.strerror}", file=sys.stderr, flush=True)
         os._exit(127)

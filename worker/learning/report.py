@@ -21,6 +21,8 @@ from worker.learning.hooks import Hook
 from worker.learning.watch import HISTORY, Watch
 
 if TYPE_CHECKING:
+    from torch.utils.tensorboard import SummaryWriter
+
     from worker.learning.loop import Loop
     from worker.learning.training import Training
     from worker.tasks.run.task_report import TaskReport
@@ -124,8 +126,6 @@ class Report:
     """
 
     def __init__(self, training: Training, resumed_from: int, device: str) -> None:
-        from torch.utils.tensorboard import SummaryWriter
-
         job, self._iterations = training.job, training.iterations
         self._task, self._run = str(job.section.get("task")), job.run
         self._rated_at = resumed_from + WARMED if device == "cpu" else 0
@@ -137,7 +137,7 @@ class Report:
                     self._watch.warnings(record)
         self._has_failed, self._warned_of = False, set[str]()
         threading.excepthook = partial(_thread_failed, threading.excepthook)
-        self._new_events = partial(SummaryWriter, str(job.run.metrics), filename_suffix=f".e{job.epoch}", flush_secs=10)
+        self._epoch = job.epoch
         self._events: SummaryWriter | None = None
 
     def iteration(self, record: dict[str, Any]) -> None:
@@ -188,8 +188,15 @@ class Report:
 
     def _write_events(self, record: Mapping[str, Any]) -> None:
         if self._events is None:
+            from torch.utils.tensorboard import SummaryWriter  # it takes a while, which no iteration waits for here
+
             self._run.metrics.stat()  # it would be made where another volume is
-            self._events = self._new_events(purge_step=record["iteration"])
+            self._events = SummaryWriter(
+                str(self._run.metrics),
+                purge_step=record["iteration"],
+                filename_suffix=f".e{self._epoch}",
+                flush_secs=10,
+            )
         try:
             for name, value in scalars(record).items():
                 self._events.add_scalar(name, value, record["iteration"])
