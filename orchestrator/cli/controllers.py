@@ -12,7 +12,6 @@ from orchestrator.cli.progress import follow, following
 from orchestrator.cli.terminal import echo
 from orchestrator.client import Client
 from orchestrator.domain.errors import NotServing, ServerError, Unreachable
-from orchestrator.engines.local.fork_server import prepare
 from orchestrator.home import ControllerRuns, local_url, muster_home
 
 
@@ -81,8 +80,6 @@ def _controller(store: str | None, cpus: float | None, engines: Sequence[str]) -
                     )
                 yield client
                 return
-    if "local" in (engines or ("local",)):
-        prepare()  # it imports while this process does
     from orchestrator.server import Server
 
     try:

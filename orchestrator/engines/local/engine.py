@@ -17,7 +17,7 @@ import resource
 import signal
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -198,22 +198,19 @@ class LocalEngine:
 
     def close(self) -> None:
         """Supervisors go on."""
-        if self._fork_server is not None:
-            self._fork_server.close()
 
     @contextmanager
     def _forks(self, nodes: Sequence[NodeProcess]) -> Iterator[ForkServer | None]:
         """Where the nodes of a gang can be forked: a server of its own is worth it where several ranks would import the same."""
-        if self._fork_server is not None or sum(node.forkable for node in nodes) < 2:
-            yield self._fork_server
-            return
+        server, self._fork_server = self._fork_server, None
+        with suppress(OSError):
+            if server is None and sum(node.forkable for node in nodes) > 1:
+                server = ForkServer()
         try:
-            server = ForkServer()
-        except OSError:
-            yield None
-            return
-        with closing(server):
             yield server
+        finally:
+            if server is not None:
+                server.close()
 
     def _forget(self, gang: str, nodes: Sequence[Mapping[str, object]]) -> None:
         """Nothing of the gang is left: remove what was kept of its supervisors."""
