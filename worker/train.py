@@ -29,9 +29,14 @@ def main() -> int:
 
 
 def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
+    from worker.learning.startup import Startup
+
+    startup = Startup()
     from worker.learning.distributed import connect_rank
 
+    startup.mark("torch")
     gang = connect_rank(os.environ)
+    startup.mark("gang")
     if not isinstance(job.section.get("task"), str):
         raise UserError("train.task: the name of a task is missing")
     from worker.tasks import find_task
@@ -45,13 +50,15 @@ def _train(job: Job, stop: StopRequest, tracking: Tracking) -> int:
     from worker.learning.training import Training
 
     training = Training.of(job, task_type)
+    startup.mark("task and simulator")
     tracking.check()
     learner = training.algorithm_type, training.settings
     worlds = -(-total_worlds(job, gang) // gang.size)
     loop: Loop | None = None
     # All memory is allocated in the first iterations; a later out-of-memory error has another cause.
     with within_memory(task_type, training.config, learner, worlds, gang, lambda: loop is None or loop.iterated < 3):
-        loop = Loop(training, gang, stop, hooks())
+        loop = Loop(training, gang, stop, [startup, *hooks()])
+        startup.mark("worlds and learner")
         code = train(loop, stop)
     loop.close()
     return code
