@@ -26,7 +26,7 @@ DEFERRED = frozenset(
         *("glfw", "newton._src.viewer"),
         # Newton's own collisions and couplings: MuJoCo-Warp does the physics
         *("newton._src.sim.collide", "newton._src.geometry.narrow_phase", "newton._src.geometry.particle_surface"),
-        "newton._src.geometry.sdf_hydroelastic",
+        *("newton._src.geometry.sdf_hydroelastic", "newton._src.geometry.sdf_contact"),
         *("newton._src.solvers.coupled.solver_coupled", "newton._src.solvers.coupled.solver_coupled_admm"),
         "newton._src.solvers.coupled.solver_coupled_proxy",
         # USD files, whose library is large, and starts a thread
