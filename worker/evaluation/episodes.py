@@ -109,6 +109,7 @@ def play(
     episodes: int | None = None,
     is_stop_requested: Callable[[], bool] = lambda: False,
     watch: Callable[[torch.Tensor], None] | None = None,
+    count: Callable[[int, int], None] = lambda done, total: None,
 ) -> Episodes:
     """One episode of every world in each round; all ranks call it.
 
@@ -122,13 +123,14 @@ def play(
         episodes: How many are kept, the first ones; all by default.
         is_stop_requested: Whether this rank was requested to leave; checked now and then.
         watch: Called after each control step with the worlds whose episode had not ended before it, shape ``(worlds,)``, bool.
+        count: Called now and then with the control steps of the round that are done, and how many it has at most.
 
     Raises:
         Stopped: A rank was requested to leave.
     """
     parts, task = [], None
     for task in rounds:
-        parts.append(_gather(_one_round(task, policy, gang, is_stop_requested, watch), gang))
+        parts.append(_gather(_one_round(task, policy, gang, is_stop_requested, watch, count), gang))
     assert task is not None
     ended = task.ended
     success = ended.meaning if ended and ended.says_success else None
@@ -143,6 +145,7 @@ def _one_round(
     gang: Gang,
     is_stop_requested: Callable[[], bool],
     watch: Callable[[torch.Tensor], None] | None,
+    count: Callable[[int, int], None],
 ) -> torch.Tensor:
     """Rows of the first episode of each world after a reset, shape ``(worlds, columns)``."""
     task.reset()
@@ -163,6 +166,7 @@ def _one_round(
         running &= ~ended
         # all ranks decide alike; where all episodes are short it saves most of the time
         if step % _CHECKED == _CHECKED - 1:
+            count(step + 1, task.max_episode_length)
             state = gang.greatest(2 if is_stop_requested() else int(running.any()))
             if state == 2:
                 raise Stopped

@@ -7,7 +7,7 @@ import io
 import math
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
@@ -207,13 +207,22 @@ class Watcher(Protocol):
 
 
 def evaluate(
-    task: Task, policy: Policy, gang: Gang, *, checkpoint: str, episodes: int | None = None
+    task: Task,
+    policy: Policy,
+    gang: Gang,
+    *,
+    checkpoint: str,
+    episodes: int | None = None,
+    count: Callable[[int, int], None] = lambda done, total: None,
 ) -> EvaluatedEpisodes:
-    """Run at least ``episodes`` episodes, by default one a world; all ranks call it. The worlds are left as they were."""
+    """Run at least ``episodes`` episodes, by default one a world; all ranks call it. The worlds are left as they were.
+
+    ``count``: See :func:`worker.evaluation.episodes.play`.
+    """
     started = time.perf_counter()
     before = task.state_dict()
     worlds = int(gang.sum(torch.tensor(float(task.world_count), device=gang.device)))
-    played = play([task] * (1 if episodes is None else math.ceil(episodes / worlds)), policy, gang)
+    played = play([task] * (1 if episodes is None else math.ceil(episodes / worlds)), policy, gang, count=count)
     task.load_state_dict(before)
     task.clear_statistics()
     return result_of(task, played, checkpoint, None, started)

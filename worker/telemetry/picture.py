@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -152,15 +152,27 @@ class EpisodePicture:
         self._tap = Tap(task, 1, rows=min(task.max_episode_length + 1, _EPISODE_STEPS))
         self._tap.open()
 
-    def picture(self, config: TaskConfig, width: int = 320, height: int = 180) -> bytes:
-        """:data:`MOMENTS` frames of that size as one PNG."""
+    def picture(
+        self,
+        config: TaskConfig,
+        width: int = 320,
+        height: int = 180,
+        count: Callable[[int, int], None] = lambda done, total: None,
+    ) -> bytes:
+        """:data:`MOMENTS` frames of that size as one PNG.
+
+        ``count``: called after each with how many are done, and how many there will be.
+        """
         rows = TapReader(self._tap).take()
         self._tap.close()
         length = int(np.argmax(rows.mark("done")[:, 0])) if rows.mark("done").any() else len(rows)
         span = max(1, min(length, round(_EPISODE_SECONDS * config.control_hz)))
         camera = StageCamera(Stage(type(self._task), config, 1, self._task.device), width, height)
-        steps = np.linspace(0, span - 1, MOMENTS).round().astype(int)
-        return encode([tiled([camera.take(rows.coordinates[step]) for step in steps], *STRIP)], ".png", 1.0)
+        frames = []
+        for step in np.linspace(0, span - 1, MOMENTS).round().astype(int):
+            frames.append(camera.take(rows.coordinates[step]))
+            count(len(frames), MOMENTS)
+        return encode([tiled(frames, *STRIP)], ".png", 1.0)
 
 
 def encode(pictures: Sequence[np.ndarray], ending: str, rate: float) -> bytes:
