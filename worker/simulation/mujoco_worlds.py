@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from worker.simulation.tiling import repeated
+from worker.simulation.tiling import fill
 
 
 class MujocoWorlds:
@@ -33,7 +34,7 @@ class MujocoWorlds:
         """``mujoco_warp.put_model``, with as many rows of each field as ``batch_sizes`` says."""
         one = self._module.put_model(model)
         for name, count in (batch_sizes or {}).items():
-            setattr(one, name, _of_worlds(getattr(one, name), count))
+            setattr(one, name, _of_worlds(getattr(one, name), count, (1,)))
         return one
 
     def put_data(self, model: Any, data: Any, nworld: int = 1, **limits: int | None) -> Any:
@@ -55,27 +56,19 @@ def _repeat(one: Any, count: int, contacts: int) -> None:
     for field in dataclasses.fields(one):
         value, rows = getattr(one, field.name), getattr(field.type, "shape", ("",))[0]
         if rows == "nworld" and value.shape[0] == 1:
-            setattr(one, field.name, _of_worlds(value, count))
+            setattr(one, field.name, _of_worlds(value, count, (1,)))
         elif rows == "naconmax" and value.shape[0]:
-            parts = (value[first:end] for first, end in ((0, contacts), (contacts, value.shape[0])) if first < end)
-            setattr(one, field.name, _joined([repeated(part, count, part.shape[0]) for part in parts]))
+            setattr(one, field.name, _of_worlds(value, count, (contacts, value.shape[0])))
         elif field.name in ("nworld", "naconmax", "naccdmax"):
             setattr(one, field.name, count * value)
 
 
-def _joined(parts: list[wp.array[Any]]) -> wp.array[Any]:
-    if len(parts) == 1:
-        return parts[0]
-    first, second = parts
-    rows = first.shape[0] + second.shape[0]
-    joined: wp.array[Any] = wp.empty((rows, *first.shape[1:]), dtype=first.dtype, device=first.device)
-    wp.copy(joined[: first.shape[0]], first)
-    wp.copy(joined[first.shape[0] :], second)
-    return joined
-
-
-def _of_worlds(array: wp.array[Any], count: int) -> wp.array[Any]:
-    found: Any = repeated(array, count, 1)
+def _of_worlds(array: wp.array[Any], count: int, ends: tuple[int, ...]) -> wp.array[Any]:
+    """Each part of an array, up to each of ``ends``, ``count`` times."""
+    target: Any = wp.empty((count * ends[-1], *array.shape[1:]), dtype=array.dtype, device=array.device)
+    for first, end in itertools.pairwise((0, *ends)):
+        if first < end and array.size:
+            fill(target[count * first : count * end], array[first:end])
     if hasattr(array, "_is_batched"):  # MuJoCo-Warp's mark
-        found._is_batched = array._is_batched
-    return found
+        target._is_batched = array._is_batched
+    return target

@@ -10,8 +10,10 @@ import newton
 import numpy as np
 import warp as wp
 
+BY_NEWTON = 32
+"""Up to this many worlds Newton itself is as quick."""
 FEW = 3
-"""Up to this many worlds Newton builds itself; the rules for more are those by which it goes from one world less to this many."""
+"""Number of worlds of the larger one of the two models in which rules are found."""
 _NOT_COMPARED = ("bvh_", "_bvh_", "heightfield_", "attribute_", "soft_mesh_adjacency", "_deformable_visual")
 """Prefixes of what is built anew for all worlds, is the terrain's, says nothing of worlds, or is empty in a model without particles."""
 _NAMES = ("_deprecated_aliases", "_removed_attributes")
@@ -36,7 +38,7 @@ def tiled(scene: Callable[[int], newton.ModelBuilder], count: int, device: str) 
     Returns:
         The model. Where an attribute follows no rule, Newton itself built it, after a warning that names the attribute.
     """
-    if count <= FEW:
+    if count <= max(FEW, BY_NEWTON):
         return scene(count).finalize(device=device)
     two, builder = _with_few_heights(scene(FEW - 1)).finalize(device=device), scene(FEW)
     model = builder.finalize(device=device)
@@ -59,23 +61,17 @@ def _with_few_heights(builder: newton.ModelBuilder) -> newton.ModelBuilder:
     return builder
 
 
-def repeated(array: wp.array[Any], count: int, block: int, rest: int = 0) -> wp.array[Any]:
-    """The first ``block`` rows of an array ``count`` times, and then its last ``rest`` rows; made on its device."""
-    shape = (count * block + rest, *array.shape[1:])
-    target: wp.array[Any] = wp.empty(shape, dtype=array.dtype, device=array.device)
-    size = block * array.strides[0]
-    if size and count:
-        word = wp.uint32 if size % 4 == 0 else wp.uint8
-        step = wp.types.type_size_in_bytes(word)
+def fill(target: wp.array[Any], rows: wp.array[Any]) -> None:
+    """Fill an array with copies of rows, one behind the other, on their device. Both are contiguous; the rows fit a whole number of times."""
+    size = rows.size * wp.types.type_size_in_bytes(rows.dtype)
+    word = wp.uint32 if size % 4 == 0 else wp.uint8
+    step = wp.types.type_size_in_bytes(word)
+    shape = target.shape[0] // rows.shape[0], size // step
 
-        def rows(each: wp.array[Any], stride: int) -> wp.array[Any]:
-            words = (count, size // step)
-            return wp.array(ptr=each.ptr, dtype=word, shape=words, strides=(stride, step), device=each.device)
+    def words(array: wp.array[Any], stride: int) -> wp.array[Any]:
+        return wp.array(ptr=array.ptr, dtype=word, shape=shape, strides=(stride, step), device=array.device)
 
-        wp.copy(rows(target, size), rows(array, 0))  # whose rows are all the same one
-    if rest:
-        wp.copy(target[count * block :], array[array.shape[0] - rest :])
-    return target
+    wp.copy(words(target, size), words(rows, 0))  # each copy begins where the first one does
 
 
 class _Rule:
@@ -194,7 +190,7 @@ class _Growth:
             return {key: self._grown(f"{where}[{key!r}]", two[key], three[key]) for key in three}
         if type(three) is int and "count" in where:
             return three + (self._count - FEW) * (three - two)
-        if isinstance(three, wp.Mesh) or two == three:
+        if isinstance(three, wp.Mesh) or _is_equal(two, three):
             return three
         raise Irregular(f"{where} is {two!r} in two worlds and {three!r} in three")
 
@@ -210,7 +206,14 @@ class _Growth:
         rule = _Rule(where, two.numpy(), three.numpy())
         if not rule.is_plain:
             return wp.array(rule.rows(self._count), dtype=three.dtype, device=three.device)
-        return repeated(three, self._count, rule.block, rule.rest) if rule.block else three
+        if not rule.block:
+            return three
+        end = self._count * rule.block
+        target: wp.array[Any] = wp.empty((end + rule.rest, *three.shape[1:]), dtype=three.dtype, device=three.device)
+        fill(target[:end], three[: rule.block])
+        if rule.rest:
+            wp.copy(target[end:], three[FEW * rule.block :])
+        return target
 
     def _list(self, where: str, two: list[Any], three: list[Any]) -> list[Any]:
         block = len(three) - len(two)
@@ -229,3 +232,10 @@ class _Growth:
             raise Irregular(f"{where} differs between the worlds")
         of_none = self._rows(f"{where}[-1]", *(np.array(each[-1], np.int64) for each in (two, three))).tolist()
         return _BodyShapes(of_world, self._count, shapes, of_none)
+
+
+def _is_equal(one: Any, other: Any) -> bool:
+    try:
+        return bool(one == other)
+    except (TypeError, ValueError):  # of arrays in it
+        return False

@@ -254,8 +254,8 @@ def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.C
         )
     attributes: Any = vars(model)["mujoco"]
     count = controls.size // max(1, model.world_count)
-    unread = [column for column in range(count) if attributes.ctrl_source.numpy()[column] != direct]
-    if unread:
+    unread = (attributes.ctrl_source.numpy()[:count] != direct).nonzero()[0]
+    if unread.size:
         joints = attributes.actuator_trnid.numpy()[unread, 0]
         raise ValueError(
             f"the <position> and <velocity> actuators of {_joints(model, joints)} would ignore a task's controls, since they follow joint "
