@@ -63,7 +63,7 @@ def _repeat(one: Any, count: int, contacts: int) -> None:
             setattr(one, field.name, count * value)
 
 
-def _of_worlds(array: wp.array[Any], count: int, ends: tuple[int, ...]) -> wp.array[Any]:
+def _of_worlds(array: wp.array[Any], count: int, ends: tuple[int, ...]) -> Any:
     """Each part of an array, up to each of ``ends``, ``count`` times."""
     target: Any = wp.empty((count * ends[-1], *array.shape[1:]), dtype=array.dtype, device=array.device)
     for first, end in itertools.pairwise((0, *ends)):

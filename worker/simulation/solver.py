@@ -120,10 +120,13 @@ class Solver(SolverMuJoCo):
     @classmethod
     def import_mujoco(cls) -> tuple[Any, Any]:
         """MuJoCo and MuJoCo-Warp, as :class:`worker.simulation.mujoco_worlds.MujocoWorlds`."""
-        mujoco, mujoco_warp = super().import_mujoco()
+        find: Any = super().import_mujoco  # which has no types
+        mujoco, mujoco_warp = find()
         return mujoco, MujocoWorlds(mujoco_warp)
 
-    def _init_actuators(self, model: newton.Model, spec: Any, template_world: int, *arguments: Any, **named: Any) -> int:
+    def _init_actuators(
+        self, model: newton.Model, spec: Any, template_world: int, *arguments: Any, **named: Any
+    ) -> int:
         """Newton looks for the actuators of one world among those of all, one by one; here those of later worlds are hidden."""
         counts, own = model.custom_frequency_counts, getattr(getattr(model, "mujoco", None), "actuator_world", None)
         if own is not None:

@@ -48,7 +48,8 @@ def tiled(scene: Callable[[int], newton.ModelBuilder], count: int, device: str) 
         warnings.warn(f"the worlds are built one by one, which takes long: model.{error}", stacklevel=3)
         return scene(count).finalize(device=device)
     config = builder.default_bvh_cfg
-    model.bvh_build_shapes(model, bvh_constructor=config.shape_constructor, shape_flags=config.shape_flags)
+    state: Any = model  # as finalize has it: the poses of the model itself
+    model.bvh_build_shapes(state, bvh_constructor=config.shape_constructor, shape_flags=config.shape_flags)
     return model
 
 
@@ -88,27 +89,23 @@ class _Rule:
         self.rest = len(three) - FEW * block
         if block < 0 or self.rest < 0 or two.shape[1:] != three.shape[1:] or two.dtype != three.dtype:
             raise Irregular(f"{where} has the shape {two.shape} in two worlds and {three.shape} in three")
-        self._three = three
+        self._three, self._changes = three, None
         worlds = three[: FEW * block].reshape(FEW, block, *three.shape[1:])
         fewer = two[: 2 * block].reshape(2, block, *three.shape[1:])
         rests = three[FEW * block :], two[2 * block :]
         if three.dtype.kind in "iu" and three.dtype != np.uint64:
-            self._first, self._step = worlds[0], worlds[1] - worlds[0]
-            self._drift, self._rest_drift = worlds[0] - fewer[0], rests[0] - rests[1]
-            steps = worlds[2] - worlds[1], fewer[1] - fewer[0]
-            is_regular = all(np.array_equal(step, self._step) for step in steps)
-            self.is_plain = not any(each.any() for each in (self._step, self._drift, self._rest_drift))
+            step, *others = worlds[1] - worlds[0], worlds[2] - worlds[1], fewer[1] - fewer[0]
+            is_regular = all(np.array_equal(step, other) for other in others)
+            changes = step, worlds[0] - fewer[0], rests[0] - rests[1]
+            if any(change.any() for change in changes):
+                self._changes = changes
         else:
-            same = [each.tobytes() for each in worlds]
-            if three.dtype != np.uint64:  # an address is its own model's
-                same += [each.tobytes() for each in fewer]
-                is_regular = rests[0].tobytes() == rests[1].tobytes()
-            else:
-                is_regular = True
-            is_regular &= len(set(same)) == 1
-            self.is_plain = True
+            is_address = three.dtype == np.uint64  # each model has its own
+            same = [each.tobytes() for each in (*worlds, *(() if is_address else fewer))]
+            is_regular = len({*same}) == 1 and (is_address or rests[0].tobytes() == rests[1].tobytes())
         if not is_regular:
             raise Irregular(f"{where} differs between the worlds")
+        self.is_plain = self._changes is None
 
     def rows(self, count: int) -> Any:
         """The rows of ``count`` worlds."""
@@ -116,11 +113,11 @@ class _Rule:
         rows = np.empty((count * block + self.rest, *three.shape[1:]), three.dtype)
         worlds = rows[: count * block].reshape(count, block, *three.shape[1:])
         worlds[:], rows[count * block :] = three[:block], three[FEW * block :]
-        if not self.is_plain:
-            more = count - FEW
-            worlds += more * self._drift
-            worlds += self._step * np.arange(count, dtype=three.dtype).reshape(count, *(1,) * three.ndim)
-            rows[count * block :] += more * self._rest_drift
+        if self._changes is not None:
+            with_world, with_count, of_rest = self._changes
+            worlds += with_world * np.arange(count, dtype=three.dtype).reshape(count, *(1,) * three.ndim)
+            worlds += (count - FEW) * with_count
+            rows[count * block :] += (count - FEW) * of_rest
         return rows
 
 
@@ -179,7 +176,7 @@ class _Growth:
             raise Irregular(f"{where} is a {type(two).__name__} in two worlds and a {type(three).__name__} in three")
         if isinstance(three, wp.array | np.ndarray):
             if id(three) not in self._made:
-                make = self._array if isinstance(three, wp.array) else self._rows
+                make: Any = self._array if isinstance(three, wp.array) else self._rows
                 self._made[id(three)] = three, make(where, two, three)
             return self._made[id(three)][1]
         if isinstance(three, list):
