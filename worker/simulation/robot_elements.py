@@ -236,9 +236,11 @@ def keep_inertias(builder: newton.ModelBuilder) -> None:
 
 def unload(model: newton.Model, solver: SolverMuJoCo) -> None:
     """Take the mass from the carriers of a model, after its solver was built."""
-    bodies = [index for index, label in enumerate(model.body_label) if is_carrier(label)]
-    if not bodies:
+    count = model.body_count // model.world_count
+    carriers = [index for index, label in enumerate(model.body_label[:count]) if is_carrier(label)]
+    if not carriers:
         return
+    bodies = (count * np.arange(model.world_count)[:, None] + carriers).ravel()
     arrays: tuple[Any, ...] = (model.body_mass, model.body_inv_mass, model.body_inertia, model.body_inv_inertia)
     for array in arrays:
         values = array.numpy()

@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from worker.simulation.mujoco_worlds import MujocoWorlds
 from worker.simulation.robot_values import from_actuators
 
 wp.set_module_options({"enable_backward": False})
@@ -116,6 +117,27 @@ class Solver(SolverMuJoCo):
             warnings.filterwarnings("ignore", message=".*does not support actuator armature")
             super().__init__(model, **options)
 
+    @classmethod
+    def import_mujoco(cls) -> tuple[Any, Any]:
+        """MuJoCo and MuJoCo-Warp, as :class:`worker.simulation.mujoco_worlds.MujocoWorlds`."""
+        find: Any = super().import_mujoco  # which has no types
+        mujoco, mujoco_warp = find()
+        return mujoco, MujocoWorlds(mujoco_warp)
+
+    def _init_actuators(
+        self, model: newton.Model, spec: Any, template_world: int, *arguments: Any, **named: Any
+    ) -> int:
+        """Newton looks for the actuators of one world among those of all, one by one; here those of later worlds are hidden."""
+        counts, own = model.custom_frequency_counts, getattr(getattr(model, "mujoco", None), "actuator_world", None)
+        if own is not None:
+            seen = np.isin(own.numpy(), (template_world, -1)).nonzero()[0]
+            model.custom_frequency_counts = counts | {"mujoco:actuator": int(seen.max(initial=-1)) + 1}
+        try:
+            added: int = super()._init_actuators(model, spec, template_world, *arguments, **named)
+        finally:
+            model.custom_frequency_counts = counts
+        return added
+
     def _mujoco_warp_step(self) -> None:
         for _ in range(self.substeps):
             for launch in self.before_substep:
@@ -196,10 +218,11 @@ class Solver(SolverMuJoCo):
 
 
 def _fixed_bodies(model: newton.Model) -> set[int]:
-    """Bodies connected to the world only by fixed joints."""
+    """Bodies of the first world, or of none, that are connected to the world only by fixed joints."""
     fixed = {-1}
-    joints = zip(model.joint_type.numpy(), model.joint_parent.numpy(), model.joint_child.numpy(), strict=True)
-    for kind, parent, child in joints:  # parents come first
-        if kind == newton.JointType.FIXED and int(parent) in fixed:
-            fixed.add(int(child))
+    chosen = model.joint_world.numpy() <= 0
+    columns = (each.numpy()[chosen].tolist() for each in (model.joint_type, model.joint_parent, model.joint_child))
+    for kind, parent, child in zip(*columns, strict=True):  # parents come first
+        if kind == newton.JointType.FIXED and parent in fixed:
+            fixed.add(child)
     return fixed

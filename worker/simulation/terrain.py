@@ -32,6 +32,8 @@ POINT_LIMIT = 80_000_000
 """Number of points from which the indices of Newton's mesh would not fit in 32 bits."""
 LABEL = "terrain"
 """Prefix of its shapes' labels, before a slash."""
+COLOR = (0.125, 0.125, 0.15)
+"""Red, green and blue of the ground, those of Newton's plane; Newton's other choice would depend on the number of worlds."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,6 +258,7 @@ class Terrain:
             xform=wp.transform((0.0, y, 0.0), wp.quat_identity()),
             heightfield=newton.Heightfield(heights, rows, columns, hx=half[0], hy=half[1]),
             cfg=config,
+            color=COLOR,
             label=f"{LABEL}/{name}",
             # Newton's own choice, 0.1 mm, would let a shape that is a little too deep fall through
             custom_attributes={"mujoco:hfield_base": DEPTH},
@@ -278,7 +281,7 @@ def _add_box(
     """Add level ground at height 0; returns its shape."""
     place = wp.transform((*middle, -0.5 * DEPTH), wp.quat_identity())
     return builder.add_shape_box(
-        -1, xform=place, hx=half[0], hy=half[1], hz=0.5 * DEPTH, cfg=config, label=f"{LABEL}/{name}"
+        -1, xform=place, hx=half[0], hy=half[1], hz=0.5 * DEPTH, cfg=config, color=COLOR, label=f"{LABEL}/{name}"
     )
 
 

@@ -19,6 +19,7 @@ from worker.simulation.solver import Solver
 from worker.simulation.structs import filled
 from worker.simulation.terrain import Terrain
 from worker.simulation.terrain_arrays import Ground
+from worker.simulation.tiling import tiled
 
 wp.set_module_options({"enable_backward": False})
 
@@ -124,25 +125,30 @@ class Worlds:
         solver_options: Mapping[str, Any],
     ) -> None:
         _check_options(solver_options)
-        scene = empty_builder()
         has_masks = share(template)
-        keep_inertias(scene)
-        scene.replicate(template, world_count)
         if isinstance(ground, Terrain):
             ground.check_memory(device)
-            ground.add_to(scene)
-        elif ground:
-            scene.add_ground_plane()
-        if has_masks:
-            share_ground(scene)
-        # Newton gives a shape whose file says nothing a gap of 0.1 m, in which contacts are found, stored and not used; MuJoCo gives
-        # none. Without it there are 3 to 4 times fewer of them on a robot that stands.
-        scene.shape_gap = [0.0 if gap == scene.rigid_gap else gap for gap in scene.shape_gap]
+
+        def scene(count: int) -> newton.ModelBuilder:
+            builder = empty_builder()
+            keep_inertias(builder)
+            builder.replicate(template, count)
+            if isinstance(ground, Terrain):
+                ground.add_to(builder)
+            elif ground:
+                builder.add_ground_plane()
+            if has_masks:
+                share_ground(builder)
+            # Newton gives a shape whose file says nothing a gap of 0.1 m, in which contacts are found, stored and not used; MuJoCo gives
+            # none. Without it there are 3 to 4 times fewer of them on a robot that stands.
+            builder.shape_gap = [0.0 if gap == builder.rigid_gap else gap for gap in builder.shape_gap]
+            return builder
+
         self.ground = Ground(ground, world_count, device) if isinstance(ground, Terrain) else None
         with warnings.catch_warnings():
             # of height fields that can't collide with each other; those of a terrain don't
             warnings.filterwarnings("ignore", message="Heightfield-vs-heightfield")
-            self.model = scene.finalize(device=device)
+            self.model = tiled(scene, world_count, device)
         self.solver = Solver(self.model, **_SET_HERE, **solver_options)
         unload(self.model, self.solver)
         self.solver.substeps = substeps
@@ -248,8 +254,8 @@ def _check_controls(model: newton.Model, solver: SolverMuJoCo, control: newton.C
         )
     attributes: Any = vars(model)["mujoco"]
     count = controls.size // max(1, model.world_count)
-    unread = [column for column in range(count) if attributes.ctrl_source.numpy()[column] != direct]
-    if unread:
+    unread = (attributes.ctrl_source.numpy()[:count] != direct).nonzero()[0]
+    if unread.size:
         joints = attributes.actuator_trnid.numpy()[unread, 0]
         raise ValueError(
             f"the <position> and <velocity> actuators of {_joints(model, joints)} would ignore a task's controls, since they follow joint "
