@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import sys
 from collections.abc import Sequence
@@ -19,17 +20,16 @@ def main() -> None:
         prepare()
     from orchestrator.cli import main as run
 
-    run()
+    try:
+        run()
+    finally:
+        gc.freeze()  # the interpreter would look through all objects once more, for half a second, and then forget them
 
 
 def runs_job(arguments: Sequence[str]) -> bool:
     """Whether the command with these arguments will run a job on a controller of its own."""
-    if (
-        not arguments
-        or arguments[0] not in _RUN_JOBS
-        or _RUN_NONE.intersection(arguments)
-        or os.environ.get("MUSTER_URL")
-    ):
+    is_one = arguments and arguments[0] in _RUN_JOBS and not _RUN_NONE.intersection(arguments)
+    if not is_one or os.environ.get("MUSTER_URL"):
         return False
     from orchestrator.home import local_url
 
