@@ -1,4 +1,4 @@
-"""The kernels of a task, found by a dry pass: its worlds are built and stepped once, with launches noted instead of made.
+"""The listing of a task's kernels by a dry pass: its worlds are built and stepped once, with launches noted instead of made.
 
 The solver makes about a hundred kernels as it first launches them. Compiled one by one they take minutes of one core. The dry pass
 makes the same objects, which the real worlds use afterwards, so that they can be compiled beside each other.
@@ -26,9 +26,6 @@ from worker.learning.randomness import generator_state, restore_generators
 from worker.settings.task import TaskConfig
 from worker.tasks.run.task import Task
 
-WORLDS = 2
-"""Number of worlds of a dry pass; no kernel depends on it."""
-
 
 class Kernels(NamedTuple):
     """One Warp module, compiled for one size of thread blocks: a file in the cache."""
@@ -52,6 +49,7 @@ def kernels_of(
     algorithms: tuple[ModuleType, ...] = (),
     has_picture: bool = False,
     for_gpu: bool = False,
+    worlds: int = 2,
     noted: Callable[[Kernels], object] = lambda _: None,
 ) -> list[Kernels]:
     """The kernels that the task launches, in the order of their first launch. Nothing is launched on the device.
@@ -65,6 +63,7 @@ def kernels_of(
         algorithms: Modules with kernels of learning algorithms.
         has_picture: Whether to list those of the evaluation's picture, too.
         for_gpu: Whether to list what a GPU would launch, on a machine without one.
+        worlds: Number of worlds that are built; no kernel depends on it.
         noted: Called at each kernel's first launch, and again once another overload of a generic kernel is launched.
 
     Raises:
@@ -77,9 +76,9 @@ def kernels_of(
             warnings.simplefilter("ignore")
             for module in algorithms:
                 wp.load_module(module, device)
-            task = _built(task_type, config, device, notes)
+            task = _built(task_type, config, worlds, device, notes)
             if has_picture:
-                _draw(task, notes)
+                _draw(task)
     finally:
         restore_generators(state)
     return list(notes.found)
@@ -183,7 +182,7 @@ class _Notes:
         return updated
 
 
-def _built(task_type: type[Task], config: TaskConfig, device: str, notes: _Notes) -> Task:
+def _built(task_type: type[Task], config: TaskConfig, worlds: int, device: str, notes: _Notes) -> Task:
     """The task up to the first capture of its step, when all its kernels have been launched."""
     task = task_type.__new__(task_type)
 
@@ -193,11 +192,11 @@ def _built(task_type: type[Task], config: TaskConfig, device: str, notes: _Notes
 
     vars(task)["_template"] = template
     with contextlib.suppress(_Captured):
-        task.__init__(config, WORLDS, device=device)  # type: ignore[misc]
+        task.__init__(config, worlds, device=device)  # type: ignore[misc]
     return task
 
 
-def _draw(task: Task, notes: _Notes) -> None:
+def _draw(task: Task) -> None:
     """What the picture of a policy launches."""
     from worker.telemetry.picture import MOMENTS, StageCamera
     from worker.telemetry.stage import Stage
@@ -206,7 +205,7 @@ def _draw(task: Task, notes: _Notes) -> None:
     with contextlib.suppress(_Captured):
         Tap(task, 1, rows=MOMENTS).open()
     camera = StageCamera(Stage(type(task), task.config, 1, task.device), 64, 64)
-    camera.take(torch.zeros(1, task.worlds.model.joint_coord_count // WORLDS).numpy())
+    camera.take(torch.zeros(1, task.worlds.model.joint_coord_count // task.world_count).numpy())
 
 
 def _both(condition: Any, on_true: Any = None, on_false: Any = None, stream: Any = None, **values: Any) -> None:
