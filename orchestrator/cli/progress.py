@@ -18,13 +18,15 @@ from orchestrator.client import Client, named
 from orchestrator.domain import reasons
 from orchestrator.domain.errors import ApiError, Unreachable
 from orchestrator.domain.job import TERMINAL, WAITING
-from shared_store.contract.phases import Phase, phase_in
+from shared_store.contract.phases import Phase, phase_in, shown_phase
 from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.metrics import warnings_of
 
 _POLL = 0.3
 _OF_LIBRARIES = re.compile(r'Warp CUDA warning|\{"|(?:DEBUG|INFO):[\w.]+:')
 """Beginning of a line that a library logs: a machine without GPUs, JSON, or details by Python's logging."""
+_COUNT = re.compile(r" \d+/\d+$")
+"""Behind a phase."""
 _PLAIN_INTERVAL = 2.0
 """Seconds between two plain lines of progress."""
 
@@ -266,11 +268,11 @@ class _Display:
         phase = phase_in(job)
         if phase and phase.is_before_training and self.iteration:
             phase = None  # the metrics are newer than the node's report
-        text = phase.words if phase else "" if self.iteration else "loading libraries"
-        text = text if job["status"] == "RUNNING" else ""
-        if text == self._phase:
+        text = shown_phase(job) if phase else "" if self.iteration else "loading libraries"
+        before, self._phase = self._phase, text if job["status"] == "RUNNING" else ""
+        if _COUNT.sub("", self._phase) == _COUNT.sub("", before):
             return False
-        self._phase, self._since = text, time.monotonic()
+        self._since = time.monotonic()
         return True
 
     @property
@@ -344,7 +346,7 @@ class _Lines(_Display):
 
     def __init__(self, detail: dict[str, Any]) -> None:
         super().__init__(detail)
-        self._state = ""
+        self._state = self._printed_phase = ""
         self._latest: dict[str, Any] | None = None
         self._printed = 0.0
 
@@ -364,10 +366,12 @@ class _Lines(_Display):
         if record:
             self.eta(record)
             self._latest, self.iteration = record, record["iteration"]
-        if self.enter(job) and self.doing:
+        is_new, is_due = self.enter(job), time.monotonic() - self._printed >= _PLAIN_INTERVAL
+        if self.doing and (is_new or (is_due and self._phase != self._printed_phase)):
             self._flush()
             echo(self._phase)
-        if time.monotonic() - self._printed >= _PLAIN_INTERVAL:
+            self._printed_phase, self._printed = self._phase, time.monotonic()
+        elif is_due:
             self._flush()
 
     def _flush(self) -> None:

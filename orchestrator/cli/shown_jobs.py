@@ -29,7 +29,7 @@ from orchestrator.domain.hosts import engine_of
 from orchestrator.domain.job import Status
 from orchestrator.engines.installed import traits_of
 from shared_store.contract.error_text import counted, nearest
-from shared_store.contract.phases import phase_in
+from shared_store.contract.phases import shown_phase
 from shared_store.contract.plugins import sections
 from shared_store.volume.evaluations import in_one_line
 from shared_store.volume.learning_metrics import in_words
@@ -191,7 +191,7 @@ def _facts(detail: Mapping[str, Any]) -> dict[str, object]:
     facts: dict[str, object] = {
         "why": _reason(detail),
         "in AWS's API": "" if detail["status"] == "SUCCEEDED" else one_line(detail["awsCode"] or ""),
-        "phase": phase.words if (phase := phase_in(detail)) else "",
+        "phase": shown_phase(detail),
         "owner": owner_of(detail),
         "created": date_ms(detail["createdAt"]),
         "took": duration(detail["ranSeconds"]) or "-",

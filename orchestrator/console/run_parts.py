@@ -13,7 +13,7 @@ from orchestrator.domain.job import Status
 from orchestrator.persistence.ownership import born_at
 from orchestrator.services import runs
 from shared_store.contract.error_text import counted
-from shared_store.contract.phases import Phase
+from shared_store.contract.phases import shown_phase
 from shared_store.volume.checkpoints import Checkpoint, best_checkpoint, list_checkpoints
 from shared_store.volume.evaluations import by_checkpoint, changes_in_lines
 from shared_store.volume.layout import Run
@@ -57,7 +57,7 @@ def facts_of_job(job: Mapping[str, Any], definition: str) -> Facts:
         ("Attempt", _attempt_of(job)),
         ("Where", nodes(attempts[-1]["nodes"]) if attempts and runs_on else ""),
         ("Running for" if job["runsSince"] else "Ran", ran(job)),
-        ("Phase", Phase(job["phase"]).words if job["phase"] else ""),
+        ("Phase", shown_phase(job)),
         ("Time left", duration(left * seconds) if runs_on and head["iteration"] and left > 0 and seconds else ""),
         ("Since the last iteration", age(last.get("time"), 1000) if runs_on else ""),
         ("Reward", count(last.get("reward"))),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any
@@ -19,11 +20,6 @@ class Phase(StrEnum):
     DRAWING = "drawing the policy"
 
     @property
-    def words(self) -> str:
-        """For people; kernels may be in the cache already."""
-        return "loading kernels (compiling them the first time takes minutes)" if self is Phase.COMPILING else str(self)
-
-    @property
     def is_before_training(self) -> bool:
         """Whether no iteration has begun."""
         return self in (Phase.COMPILING, Phase.BUILDING)
@@ -35,3 +31,15 @@ def phase_in(progress: Mapping[str, Any] | None) -> Phase | None:
         return Phase((progress or {})["phase"])
     except (KeyError, ValueError):  # a program writes what it likes
         return None
+
+
+def kernels_in(progress: Mapping[str, Any] | None) -> str | None:
+    """How many kernels are compiled, of how many, in a node's progress: ``37/120``; None where it compiles none."""
+    count = (progress or {}).get("kernels")
+    is_count = isinstance(count, str) and re.fullmatch(r"\d{1,5}/\d{1,5}", count)
+    return count if is_count and phase_in(progress) is Phase.COMPILING else None
+
+
+def shown_phase(progress: Mapping[str, Any] | None) -> str:
+    """The phase in words for people: ``compiling kernels 37/120``; empty without one."""
+    return " ".join(filter(None, (phase_in(progress), kernels_in(progress))))

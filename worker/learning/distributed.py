@@ -9,16 +9,12 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import hashlib
-import inspect
 import os
 import socket
 import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import timedelta
-from importlib import metadata
-from pathlib import Path
 
 import torch
 import torch.distributed as dist
@@ -130,33 +126,26 @@ class Gang:
         return answer[1:] if answer.startswith("+") else None
 
     @contextlib.contextmanager
-    def build_in_turn(self, warm: Path | None = None, what: str = "task") -> Iterator[None]:
-        """Compile kernels once a cache: the first rank of each (host, cache) builds, then the others, which find it warm.
+    def in_turn(self, what: str) -> Iterator[None]:
+        """A block that the first rank of each (host, kernel cache) goes through before the others, which find that cache filled.
 
         Args:
-            what: What is built; only the first time of each is in turn.
-            warm: A marker in the cache that says that this was built before: then nobody waits, since all builds are quick.
-                The marker is a hint. Where it is wrong, kernels are compiled several times, and nothing else happens.
+            what: What is done; only the first time of each is in turn.
 
         Raises:
-            GangError: The main rank has ended, or a build took longer than ``BUILD_SECONDS``.
+            GangError: The main rank has ended, or the first rank took longer than ``BUILD_SECONDS``.
         """
         first = self._sites.index(self._sites[self.rank])
-        if self.store is not None and self._sites.count(self._sites[self.rank]) > 1:
+        key = f"done/{what}/{first}"
+        if self.store is not None and self.rank != first:
             with _needs_main_rank():
-                if self.rank == first:
-                    self.store.set(f"warm/{what}/{first}", "1" if warm is not None and warm.exists() else "0")
-                elif self.store.get(f"warm/{what}/{first}") == b"0":
-                    self.store.wait([f"built/{what}/{first}"], timedelta(seconds=BUILD_SECONDS))
+                self.store.wait([key], timedelta(seconds=BUILD_SECONDS))
         try:
             yield
-            if warm is not None and self.rank == first:
-                with contextlib.suppress(OSError):
-                    warm.mkdir(parents=True, exist_ok=True)
         finally:
             if self.store is not None and self.rank == first:
                 with _needs_main_rank():
-                    self.store.set(f"built/{what}/{first}", "1")
+                    self.store.set(key, "1")
 
     def close(self) -> None:
         """Leave the process group."""
@@ -322,29 +311,3 @@ def use_cpu_threads(env: Mapping[str, str]) -> None:
     threads = env.get("OMP_NUM_THREADS", "")
     share = len(os.sched_getaffinity(0)) // max(1, int(env.get("LOCAL_WORLD_SIZE", "1")))
     torch.set_num_threads(int(threads) if threads.isdecimal() and int(threads) > 0 else max(1, share))
-
-
-def warm_marker(task: type, device: str) -> Path | None:
-    """The marker for :meth:`Gang.build_in_turn` of ``task``'s kernels in ``WARP_CACHE_PATH``; None where that is not set.
-
-    Its name changes with the task's source, the simulation's versions and the kind of GPU. ``wp.clear_kernel_cache`` deletes it
-    with the kernels, since it begins with ``wp_``.
-    """
-    cache = os.environ.get("WARP_CACHE_PATH")
-    if not cache:
-        return None
-    parts = [f"{task.__module__}:{task.__qualname__}", device.partition(":")[0]]
-    if device.startswith("cuda"):
-        parts.append(torch.cuda.get_device_name(device))
-    for package in ("warp-lang", "newton", "mujoco-warp"):
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            parts.append(metadata.version(package))
-    with contextlib.suppress(TypeError, OSError):
-        # its kernels may lie in the modules of its bases
-        parts.extend(Path(inspect.getfile(each)).read_text() for each in task.__mro__ if each is not object)
-    # below Warp's version, where it keeps its own: a folder of this name beside it would make it warn
-    return (
-        Path(cache)
-        / metadata.version("warp-lang")
-        / f"wp_muster_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
-    )

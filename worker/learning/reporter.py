@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from shared_store.contract.error_text import counted
+from shared_store.contract.phases import Phase
 from shared_store.volume.epoch import check_epoch
 from shared_store.volume.layout import Run
 
@@ -29,6 +30,8 @@ _MOST = 10_000
 """Calls that wait while the volume does not take them; later ones are dropped."""
 _HELD = 0.02
 """Longest wait of a thread at the :class:`Gate` [s]."""
+_PRINTED_EVERY = 10.0
+"""Time between two lines about compiled kernels [s]."""
 _FAREWELL = 30.0
 """Longest wait at the end of a training for the volume to take the last records [s]."""
 
@@ -151,7 +154,8 @@ def _warn(error: Exception) -> None:
 
 class Beacon:
     """Messages of a rank to its supervisor, one JSON line each on an inherited pipe: ``phase``
-    (:class:`shared_store.contract.phases.Phase`), ``iteration`` and ``steps_per_second``, ``message`` (of a save), ``done``.
+    (:class:`shared_store.contract.phases.Phase`), ``kernels`` (of its compilation: ``37/120``), ``iteration`` and
+    ``steps_per_second``, ``message`` (of a save), ``done``.
 
     A message that finds the pipe full is dropped: the supervisor needs the newest, and the loop must not wait for it.
     Without a supervisor (torchrun, a debugger) nothing is sent.
@@ -171,3 +175,24 @@ class Beacon:
             pass
         except OSError:
             self._descriptor = None  # the supervisor no longer listens
+
+
+class CompilerProgress:
+    """Reports how many kernels are compiled: to the supervisor each time, in the output now and then.
+
+    Args:
+        beacon: Where the phase is reported; None: nowhere.
+        is_printed: Whether lines are printed.
+    """
+
+    def __init__(self, beacon: Beacon | None, *, is_printed: bool) -> None:
+        self._beacon, self._is_printed = beacon, is_printed
+        self._printed = -_PRINTED_EVERY
+
+    def __call__(self, done: int, total: int) -> None:
+        count = f"{done}/{total}"
+        if self._beacon is not None:
+            self._beacon.send(phase=Phase.COMPILING, kernels=count)
+        if self._is_printed and (done == total or time.monotonic() - self._printed >= _PRINTED_EVERY):
+            print(f"{Phase.COMPILING} {count}", flush=True)
+            self._printed = time.monotonic()

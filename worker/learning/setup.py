@@ -18,11 +18,12 @@ from shared_store.contract.policy_changes import brief, differences, robot_chang
 from shared_store.volume.checkpoints import Checkpoint
 from shared_store.volume.epoch import check_epoch
 from shared_store.volume.files import read_json, write_json
+from worker.kernels.warm_start import compile_kernels, cores, is_warm
 from worker.learning.algorithm import Algorithm, ExportedPolicy, LearningSetting, Spaces, Transition, WorldShare
 from worker.learning.algorithms import refuse_incomplete
-from worker.learning.distributed import Gang, warm_marker
+from worker.learning.distributed import Gang
 from worker.learning.job import Job, user_errors
-from worker.learning.reporter import Beacon
+from worker.learning.reporter import Beacon, CompilerProgress
 from worker.settings.errors import UserError
 from worker.simulation.robot_values import shown_value
 from worker.tasks.run.adapting import begin_evaluation
@@ -38,25 +39,35 @@ if TYPE_CHECKING:
 def build_task(
     task_type: type[Task], config: TaskConfig, share: WorldShare, gang: Gang, seed: int, beacon: Beacon | None = None
 ) -> Task:
-    """This rank's worlds; kernels are compiled once per cache. Raises UserError for refused settings and for mistakes in the user's own code.
+    """This rank's worlds. Where its cache is cold, one rank compiles the kernels first, beside each other.
 
-    ``beacon``: where the phase is reported.
+    Args:
+        task_type: The task.
+        config: Its configuration.
+        share: The worlds of this rank.
+        gang: The ranks.
+        seed: Of the worlds.
+        beacon: Where the phase is reported.
+
+    Raises:
+        UserError: A setting is refused, or the user's own code has a mistake.
+        TrainingError: Kernels can't be written to the cache.
     """
-    marker = warm_marker(task_type, gang.device)
-    is_cold = marker is not None and not marker.exists()
-    if beacon is not None:
-        beacon.send(phase=Phase.COMPILING if is_cold else Phase.BUILDING)
-    if gang.is_main and is_cold:
-        print("loading kernels: compiling them takes a minute or two, the first time", flush=True)
     warp.config.log_level = warp.LOG_WARNING  # not a line for each of dozens of kernel modules
     name = f"{task_type.__module__}:{task_type.__qualname__}"
-    with user_errors(), task_mistakes(name), gang.build_in_turn(marker):
+    with user_errors(), task_mistakes(name):
+        with gang.in_turn("task"):
+            if not is_warm(task_type, gang.device):
+                report = CompilerProgress(beacon, is_printed=gang.is_main)
+                compile_kernels(task_type, config, gang.device, cores(), report)
+        if beacon is not None:
+            beacon.send(phase=Phase.BUILDING)
         return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
 
 
 def load_kernels(algorithm: type[Algorithm], gang: Gang) -> None:
     """Compile the algorithm's own Warp kernels once per cache, or load them from it. All ranks call it."""
-    with gang.build_in_turn(what="algorithm"):
+    with gang.in_turn("algorithm"):
         for module in getattr(algorithm, "kernels", ()):
             warp.load_module(module, gang.device)
 

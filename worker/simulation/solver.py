@@ -12,6 +12,7 @@ import numpy as np
 import warp as wp
 from newton.solvers import SolverMuJoCo
 
+from worker.simulation.broadphase import for_any_number
 from worker.simulation.mujoco_worlds import MujocoWorlds
 from worker.simulation.robot_values import from_actuators
 
@@ -142,7 +143,8 @@ class Solver(SolverMuJoCo):
         for _ in range(self.substeps):
             for launch in self.before_substep:
                 launch()
-            super()._mujoco_warp_step()
+            with for_any_number(self.model.world_count):
+                super()._mujoco_warp_step()
             for launch in self.after_substep:
                 launch()
 

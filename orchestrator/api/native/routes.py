@@ -45,7 +45,7 @@ from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import named_definition, queue_names
 from orchestrator.services.damaged_rows import reading
 from orchestrator.services.permissions import Actor, Operation
-from shared_store.contract.phases import Phase, phase_in
+from shared_store.contract.phases import kernels_in, phase_in
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
 from shared_store.volume.log_view import Chosen, LogView
@@ -123,7 +123,8 @@ def job_detail(
     """A job by id, by the start of its id, or by name (the newest of the caller, else of all): every attempt and node, its run and its results.
 
     ``awsCode``: what the AWS Batch API states beyond ``statusReason``: AWS's code, or AWS's own words. ``ranSeconds``: how long all
-    attempts ran, together. ``phase``: what a training does at present. ``children``: of an array, those that failed first.
+    attempts ran, together. ``phase``: what a training does at present;
+    ``kernels``: how many it has compiled, of how many. ``children``: of an array, those that failed first.
     ``storeProblem``: why there are no results, where the store does not answer. ``runIsGone``: it was deleted;
     ``runIsReplaced``: another run has its name now.
     ``isOwn``: the caller has submitted it. ``withoutEffect``: members of its definition for Fargate, which change nothing here.
@@ -152,6 +153,7 @@ def job_detail(
         with reading(job):
             attempts = [_attempt(controller, job, attempt.number) for attempt in job.attempts]
             gang, reason = job.gang, job_list.reason_of(controller, session, job)
+            doing = _doing(attempts, gang.main) if job.status == Status.RUNNING else None
             detail = {
                 "id": job.id,
                 "name": job.name,
@@ -170,7 +172,8 @@ def job_detail(
                 "startedAt": job.started_at,
                 "stoppedAt": job.stopped_at,
                 **job_list.ran(job.run_time),
-                "phase": _phase(attempts, gang.main) if job.status == Status.RUNNING else None,
+                "phase": phase_in(doing),
+                "kernels": kernels_in(doing),
                 "children": job_list.children_of(controller, session, job) if job.kind == "array" else None,
                 "nodes": len(gang.nodes),
                 "attempts": attempts,
@@ -186,10 +189,10 @@ def job_detail(
     return actor.shown(detail)
 
 
-def _phase(attempts: Sequence[dict[str, Any]], main: int) -> Phase | None:
-    """The phase of the training that runs; None where its main node has not reported one."""
+def _doing(attempts: Sequence[dict[str, Any]], main: int) -> dict[str, Any] | None:
+    """What the main node of the newest attempt reported last."""
     nodes = attempts[-1]["nodes"] if attempts else []
-    return next((phase_in(node["progress"]) for node in nodes if node["index"] == main), None)
+    return next((node["progress"] for node in nodes if node["index"] == main), None)
 
 
 def _results(run: Run) -> tuple[runs.StoredRun | None, dict[str, Any] | None]:

@@ -27,8 +27,10 @@ def compile_for(name: str) -> None:
     """The kernels of one task, and of all algorithms."""
     import warp
 
+    from worker.kernels.compiling import directory
+    from worker.kernels.warm_start import mark_of
     from worker.learning.algorithms import find_algorithm, installed
-    from worker.learning.distributed import Gang, RankPlacement, warm_marker
+    from worker.learning.distributed import Gang, RankPlacement
     from worker.learning.setup import load_kernels
     from worker.tasks import find_task
 
@@ -37,9 +39,7 @@ def compile_for(name: str) -> None:
         load_kernels(find_algorithm(algorithm), Gang(RankPlacement(), "cpu", None, ["here"]))
     task = find_task(name)
     task(task.config_type(), 2, seed=1)
-    marker = warm_marker(task, "cpu")
-    assert marker is not None, "the kernels have no cache"
-    marker.mkdir(parents=True, exist_ok=True)
+    (directory() / mark_of(task, "cpu")).mkdir(exist_ok=True)
 
 
 def _sources() -> str:

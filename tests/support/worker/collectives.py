@@ -20,7 +20,7 @@ import pytest
 WORKER = Path(__file__).resolve().parents[3] / "worker"
 _GANG = re.compile(r"(^|\.)_?gang$")
 """What an expression ends with whose value is a gang. A gang of one may be called ``alone``; :func:`other_names` finds other names."""
-_OF_A_GANG = ("sum", "broadcast", "greatest", "broadcast_text", "build_in_turn")
+_OF_A_GANG = ("sum", "broadcast", "greatest", "broadcast_text", "in_turn")
 _OF_TORCH = ("init_process_group", "all_reduce", "broadcast", "broadcast_object_list", "all_gather", "barrier")
 _OF_A_STORE = ("set", "get", "wait")
 _OF_RSL_RL = ("broadcast_parameters",)
@@ -183,7 +183,7 @@ TESTS = {
     f"{file}:{function}": f"test_{case}"
     for case, files in {
         "a_training_is_the_same_on_all_ranks_to_its_end": {
-            "learning/distributed.py": "Gang.broadcast Gang.broadcast_text Gang.build_in_turn Gang.greatest Gang.sum connect",
+            "learning/distributed.py": "Gang.broadcast Gang.broadcast_text Gang.greatest Gang.in_turn Gang.sum connect",
             "evaluation/evaluation.py": "evaluate",
             "evaluation/final_evaluation.py": "FinalEvaluation.trained",
             "learning/training.py": "as_started",

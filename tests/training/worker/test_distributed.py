@@ -126,7 +126,7 @@ def test_ranks_whose_main_rank_ends_at_the_resume_report_it_in_one_line(tmp_path
 def end_while_building() -> int:
     """Body of a rank: the main rank exits during its build, while the other one waits for it."""
     gang = connect(RankPlacement.from_env(os.environ))
-    with gang.build_in_turn():
+    with gang.in_turn("task"):
         if gang.is_main:
             os._exit(1)
     return 0
@@ -177,20 +177,22 @@ def test_the_store_listens_on_the_main_nodes_address_alone() -> None:
         os.close(held)
 
 
-def build(warm: Path | None, sites: list[str], is_taken_in_turn: bool) -> list[tuple[str, int]]:
-    """Two ranks, as threads, that each build; the order of their starts and ends. Those that need not wait meet while they build."""
+def in_turn(sites: list[str]) -> list[tuple[str, int]]:
+    """Two ranks, as threads, in a block; the order in which they enter and leave. Those that need not wait meet inside."""
     store, events = dist.HashStore(), []
-    meeting = threading.Barrier(1 if is_taken_in_turn else 2)
+    meeting = threading.Barrier(1 if sites[0] == sites[1] else 2)
 
     def rank(number: int) -> None:
         gang = Gang(RankPlacement(rank=number, world_size=2), "cpu", store, sites)
-        with gang.build_in_turn(warm):
+        with gang.in_turn("task"):
             events.append(("start", number))
             time.sleep(0.1)  # in which one that does not wait would come, too
             meeting.wait(20 * PATIENCE)
             events.append(("end", number))
+        with gang.in_turn("task"):  # only the first time
+            pass
 
-    threads = [threading.Thread(target=rank, args=(number,)) for number in (0, 1)]
+    threads = [threading.Thread(target=rank, args=(number,)) for number in (1, 0)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -198,18 +200,12 @@ def build(warm: Path | None, sites: list[str], is_taken_in_turn: bool) -> list[t
     return events
 
 
-def test_a_cold_cache_is_filled_by_one_rank_first(tmp_path: Path) -> None:
-    marker = tmp_path / "built"
-    expected = [("start", 0), ("end", 0), ("start", 1), ("end", 1)]
-    assert build(marker, ["host:cache"] * 2, is_taken_in_turn=True) == expected
-    assert marker.exists()
+def test_one_rank_of_a_kernel_cache_goes_first() -> None:
+    assert in_turn(["host:cache"] * 2) == [("start", 0), ("end", 0), ("start", 1), ("end", 1)]
 
 
-@pytest.mark.parametrize("warm", [True, False])
-def test_no_rank_waits_for_a_warm_cache_or_for_another_hosts(tmp_path: Path, warm: bool) -> None:
-    sites = ["a:cache", "a:cache" if warm else "b:cache"]
-    events = build(tmp_path if warm else tmp_path / "cold", sites, is_taken_in_turn=False)
-    assert [kind for kind, _ in events] == ["start", "start", "end", "end"]
+def test_no_rank_waits_for_another_hosts_cache() -> None:
+    assert [kind for kind, _ in in_turn(["a:cache", "b:cache"])] == ["start", "start", "end", "end"]
 
 
 @pytest.mark.parametrize(

@@ -267,7 +267,6 @@ def test_the_supervisor_receives_the_fault_that_another_attempt_would_meet(
 def test_a_training_reports_its_phases_in_their_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read, write = os.pipe()
     monkeypatch.setenv("MUSTER_PROGRESS_FD", str(write))
-    monkeypatch.delenv("WARP_CACHE_PATH", raising=False)
     monkeypatch.setenv("MUSTER_PICTURE", "0")  # its worlds have no shapes
     train(training(tmp_path, run="run", iterations=2))
     os.close(write)
@@ -277,16 +276,3 @@ def test_a_training_reports_its_phases_in_their_order(tmp_path: Path, monkeypatc
     phases = [each for each in phases if each is not None]
     at_the_end = [Phase.SAVING, Phase.EVALUATING, Phase.WRITING]
     assert phases == [Phase.BUILDING, Phase.TRAINING, 1, 2, *at_the_end]
-
-
-def test_a_cache_without_the_task_s_kernels_is_reported_as_their_compilation(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read, write = os.pipe()
-    monkeypatch.setenv("MUSTER_PROGRESS_FD", str(write))
-    monkeypatch.setenv("WARP_CACHE_PATH", str(tmp_path / "kernels"))
-    runner(training(tmp_path, run="cold", iterations=1)).close()
-    runner(training(tmp_path, run="warm", iterations=1)).close()
-    os.close(write)
-    with os.fdopen(read) as messages:
-        assert [json.loads(line).get("phase") for line in messages] == [Phase.COMPILING, Phase.BUILDING]

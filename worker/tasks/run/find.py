@@ -66,6 +66,9 @@ def find_task(name: str) -> type[Task]:
             os.getcwd()
         )  # a user's module is in the submitter's directory; last, so that it hides none of ours
     try:
+        importlib.import_module(
+            "worker.simulation"
+        )  # before newton, of which a task's module may be the first importer
         with task_mistakes(name):
             module = importlib.import_module(module_name)
     except SystemExit as error:  # else it would end who lists all tasks

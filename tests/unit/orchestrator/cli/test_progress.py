@@ -37,7 +37,7 @@ def test_a_warning_names_the_run(capsys: pytest.CaptureFixture[str]) -> None:
 LAST = {**RECORD, "iteration": 9, "warnings": []}
 PHASES = {
     None: "loading libraries",
-    "compiling kernels": "loading kernels (compiling them the first time takes minutes)",
+    "compiling kernels": "compiling kernels",
     "building worlds": "building worlds",
     "training": "training",
 }
@@ -58,6 +58,20 @@ def test_plain_lines_have_each_phase_once_before_the_first_iteration_and_after_t
             lines.show(running(phase), None)
     printed = [each for each in capsys.readouterr().out.splitlines() if not each.startswith(("iteration", "warning"))]
     assert printed[2:] == [*PHASES.values(), *AT_THE_END]
+
+
+def test_plain_lines_count_compiled_kernels_at_intervals(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("time.monotonic", lambda: now[0])
+    lines = _Lines(DETAIL)
+    for count in ("0/120", "1/120", "37/120", "37/120", "120/120"):
+        lines.show({**running("compiling kernels"), "kernels": count}, None)
+        now[0] += 1.5
+    lines.show({**running("training"), "kernels": "120/120"}, None)
+    printed = capsys.readouterr().out.splitlines()[1:]
+    assert printed == [*(f"compiling kernels {count}" for count in ("0/120", "37/120", "120/120")), "training"]
 
 
 def test_the_bar_shows_the_phase_and_for_how_long_unless_iterations_come(monkeypatch: pytest.MonkeyPatch) -> None:
