@@ -1,9 +1,9 @@
-"""A model of many equal worlds, made of Newton's own models of two and three of them."""
+"""A model of many equal worlds, made of Newton's own models of one, two and three of them."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import newton
@@ -13,7 +13,7 @@ import warp as wp
 BY_NEWTON = 32
 """Up to this many worlds Newton itself is as quick."""
 FEW = 3
-"""Number of worlds of the larger one of the two models in which rules are found."""
+"""Number of worlds of the largest one of the models in which rules are found; the others have one less and two less."""
 _NOT_COMPARED = ("bvh_", "_bvh_", "heightfield_", "attribute_", "soft_mesh_adjacency", "_deformable_visual")
 """Prefixes of what is built anew for all worlds, is the terrain's, says nothing of worlds, or is empty in a model without particles."""
 _NAMES = ("_deprecated_aliases", "_removed_attributes")
@@ -28,7 +28,8 @@ def tiled(scene: Callable[[int], newton.ModelBuilder], count: int, device: str) 
     """The model of ``scene(count)``, bit for bit that of ``finalize``, in a time that hardly depends on ``count``.
 
     Each attribute of a model with equal worlds consists of one block for each world, and behind them what all worlds share. Integers may
-    also grow linearly with the world and with the number of worlds. The rule of each is found and checked in models of two and three worlds.
+    also grow linearly with the world and with the number of worlds. The rule of each is found in models of two and three worlds and
+    checked in one of one world.
 
     Args:
         scene: Returns a builder with a number of equal worlds, and behind them what they share.
@@ -40,10 +41,11 @@ def tiled(scene: Callable[[int], newton.ModelBuilder], count: int, device: str) 
     """
     if count <= max(FEW, BY_NEWTON):
         return scene(count).finalize(device=device)
-    two, builder = _with_few_heights(scene(FEW - 1)).finalize(device=device), scene(FEW)
+    fewer = [_with_few_heights(scene(worlds)).finalize(device=device) for worlds in range(1, FEW)]
+    builder = scene(FEW)
     model = builder.finalize(device=device)
     try:
-        _Growth(count).apply(two, model)
+        _Growth(count).apply(*fewer, model)
     except Irregular as error:
         warnings.warn(f"the worlds are built one by one, which takes long: model.{error}", stacklevel=3)
         return scene(count).finalize(device=device)
@@ -84,25 +86,29 @@ class _Rule:
         is_plain: Whether all worlds have the same rows, and the others do not depend on the number of worlds.
     """
 
-    def __init__(self, where: str, two: Any, three: Any) -> None:
-        self.block = block = len(three) - len(two)
+    def __init__(self, where: str, *found: Any) -> None:
+        three = self._three = found[-1]
+        self.block = block = len(three) - len(found[-2])
         self.rest = len(three) - FEW * block
-        if block < 0 or self.rest < 0 or two.shape[1:] != three.shape[1:] or two.dtype != three.dtype:
-            raise Irregular(f"{where} has the shape {two.shape} in two worlds and {three.shape} in three")
-        self._three, self._changes = three, None
-        worlds = three[: FEW * block].reshape(FEW, block, *three.shape[1:])
-        fewer = two[: 2 * block].reshape(2, block, *three.shape[1:])
-        rests = three[FEW * block :], two[2 * block :]
+        lengths = [worlds * block + self.rest for worlds in range(1, FEW + 1)]
+        kinds = {(each.dtype, each.shape[1:]) for each in found}
+        if block < 0 or self.rest < 0 or [*map(len, found)] != lengths or len(kinds) > 1:
+            raise Irregular(f"{where} has the shapes {[each.shape for each in found]} in one, two and three worlds")
+        worlds = [each[: count * block].reshape(count, block, *each.shape[1:]) for count, each in enumerate(found, 1)]
+        rests = [each[len(each) - self.rest :] for each in found]
+        self._changes = None
         if three.dtype.kind in "iu" and three.dtype != np.uint64:
-            step, *others = worlds[1] - worlds[0], worlds[2] - worlds[1], fewer[1] - fewer[0]
-            is_regular = all(np.array_equal(step, other) for other in others)
-            changes = step, worlds[0] - fewer[0], rests[0] - rests[1]
-            if any(change.any() for change in changes):
-                self._changes = changes
+            with_world = [each[world + 1] - each[world] for each in worlds for world in range(len(each) - 1)]
+            with_count = [worlds[index + 1][0] - worlds[index][0] for index in range(FEW - 1)]
+            of_rest = [rests[index + 1] - rests[index] for index in range(FEW - 1)]
+            changes = with_world, with_count, of_rest
+            is_regular = all(np.array_equal(each, change[0]) for change in changes for each in change)
+            if any(change[0].any() for change in changes):
+                self._changes = with_world[0], with_count[0], of_rest[0]
         else:
-            is_address = three.dtype == np.uint64  # each model has its own
-            same = [each.tobytes() for each in (*worlds, *(() if is_address else fewer))]
-            is_regular = len({*same}) == 1 and (is_address or rests[0].tobytes() == rests[1].tobytes())
+            compared = slice(-1, None) if three.dtype == np.uint64 else slice(None)  # each model has its own addresses
+            same = {world.tobytes() for each in worlds[compared] for world in each}
+            is_regular = len(same) == 1 and len({each.tobytes() for each in rests[compared]}) == 1
         if not is_regular:
             raise Irregular(f"{where} differs between the worlds")
         self.is_plain = self._changes is None
@@ -151,83 +157,85 @@ class _Growth:
         self._count = count
         self._made: dict[int, tuple[Any, Any]] = {}  # an array that two attributes share stays one
 
-    def apply(self, two: newton.Model, three: newton.Model) -> None:
-        if three.particle_count or three.actuators:
+    def apply(self, *models: newton.Model) -> None:
+        if models[-1].particle_count or models[-1].actuators:
             raise Irregular("particle_count or model.actuators: only rigid bodies are tiled")
-        if three.heightfield_count != two.heightfield_count:
+        if len({model.heightfield_count for model in models}) > 1:
             raise Irregular("heightfield_count: each world has height fields of its own")
-        for owner, name, value in [*self._members("", two, three, _NOT_COMPARED)]:
+        for owner, name, value in [*self._members("", models, _NOT_COMPARED)]:
             vars(owner)[name] = value
 
-    def _members(self, where: str, two: Any, three: Any, left_out: tuple[str, ...]) -> Iterator[tuple[Any, str, Any]]:
-        if vars(two).keys() != vars(three).keys():
-            raise Irregular(f"{where} has other members in two worlds than in three")
-        for name, value in vars(three).items():
+    def _members(self, where: str, owners: Sequence[Any], left_out: tuple[str, ...]) -> Iterator[tuple[Any, str, Any]]:
+        if any(vars(owner).keys() != vars(owners[0]).keys() for owner in owners):
+            raise Irregular(f"{where} has other members in one world than in more")
+        for name in vars(owners[0]):
             if name.startswith(left_out):
                 continue
-            path, other = f"{where}{name}", vars(two)[name]
-            if type(value).__module__.startswith("newton.") and hasattr(value, "__dict__") and value != other:
-                yield from self._members(f"{path}.", other, value, _NAMES)
+            path, found = f"{where}{name}", [vars(owner)[name] for owner in owners]
+            value = found[-1]
+            if type(value).__module__.startswith("newton.") and hasattr(value, "__dict__") and value != found[0]:
+                yield from self._members(f"{path}.", found, _NAMES)
             else:
-                yield three, name, self._grown(path, other, value)
+                yield owners[-1], name, self._grown(path, *found)
 
-    def _grown(self, where: str, two: Any, three: Any) -> Any:
-        if type(two) is not type(three):
-            raise Irregular(f"{where} is a {type(two).__name__} in two worlds and a {type(three).__name__} in three")
-        if isinstance(three, wp.array | np.ndarray):
-            if id(three) not in self._made:
-                make: Any = self._array if isinstance(three, wp.array) else self._rows
-                self._made[id(three)] = three, make(where, two, three)
-            return self._made[id(three)][1]
-        if isinstance(three, list):
-            return self._list(where, two, three)
+    def _grown(self, where: str, *found: Any) -> Any:
+        value = found[-1]
+        if len({type(each) for each in found}) > 1:
+            raise Irregular(f"{where} has other types in one world than in more")
+        if isinstance(value, wp.array | np.ndarray):
+            if id(value) not in self._made:
+                make: Any = self._array if isinstance(value, wp.array) else self._rows
+                self._made[id(value)] = value, make(where, *found)
+            return self._made[id(value)][1]
+        if isinstance(value, list):
+            return self._list(where, *found)
         if where == "body_shapes":
-            return self._body_shapes(where, two, three)
-        if isinstance(three, dict) and two.keys() == three.keys():
-            return {key: self._grown(f"{where}[{key!r}]", two[key], three[key]) for key in three}
-        if type(three) is int and "count" in where:
-            return three + (self._count - FEW) * (three - two)
-        if isinstance(three, wp.Mesh) or _is_equal(two, three):
-            return three
-        raise Irregular(f"{where} is {two!r} in two worlds and {three!r} in three")
+            return self._body_shapes(where, *found)
+        if isinstance(value, dict) and all(each.keys() == value.keys() for each in found):
+            return {key: self._grown(f"{where}[{key!r}]", *(each[key] for each in found)) for key in value}
+        if type(value) is int and "count" in where:
+            return int(self._rows(where, *(np.array([each], np.int64) for each in found))[0])
+        if isinstance(value, wp.Mesh) or all(_is_equal(each, value) for each in found):
+            return value
+        raise Irregular(f"{where} has the values {found} in one, two and three worlds")
 
-    def _rows(self, where: str, two: Any, three: Any) -> Any:
+    def _rows(self, where: str, *found: Any) -> Any:
         try:
-            rows = _Rule(where, two, three).rows(self._count)
+            rows = _Rule(where, *found).rows(self._count)
         except Irregular:  # unless what the worlds share comes first
-            rows = _Rule(where, two[::-1], three[::-1]).rows(self._count)[::-1].copy()
-        rows.setflags(write=three.flags.writeable)
+            rows = _Rule(where, *(each[::-1] for each in found)).rows(self._count)[::-1].copy()
+        rows.setflags(write=found[-1].flags.writeable)
         return rows
 
-    def _array(self, where: str, two: wp.array[Any], three: wp.array[Any]) -> wp.array[Any]:
-        rule = _Rule(where, two.numpy(), three.numpy())
+    def _array(self, where: str, *found: wp.array[Any]) -> wp.array[Any]:
+        rule, array = _Rule(where, *(each.numpy() for each in found)), found[-1]
         if not rule.is_plain:
-            return wp.array(rule.rows(self._count), dtype=three.dtype, device=three.device)
+            return wp.array(rule.rows(self._count), dtype=array.dtype, device=array.device)
         if not rule.block:
-            return three
+            return array
         end = self._count * rule.block
-        target: wp.array[Any] = wp.empty((end + rule.rest, *three.shape[1:]), dtype=three.dtype, device=three.device)
-        fill(target[:end], three[: rule.block])
+        target: wp.array[Any] = wp.empty((end + rule.rest, *array.shape[1:]), dtype=array.dtype, device=array.device)
+        fill(target[:end], array[: rule.block])
         if rule.rest:
-            wp.copy(target[end:], three[FEW * rule.block :])
+            wp.copy(target[end:], array[FEW * rule.block :])
         return target
 
-    def _list(self, where: str, two: list[Any], three: list[Any]) -> list[Any]:
-        block = len(three) - len(two)
-        if not block:
-            return [self._grown(f"{where}[{index}]", two[index], three[index]) for index in range(len(three))]
-        first = three[:block]
-        if block < 0 or three[: FEW * block] != FEW * first or two[: 2 * block] != 2 * first:
+    def _list(self, where: str, *found: list[Any]) -> list[Any]:
+        block = len(found[-1]) - len(found[-2])
+        if all(len(each) == len(found[-1]) for each in found):
+            return [self._grown(f"{where}[{index}]", *each) for index, each in enumerate(zip(*found, strict=True))]
+        first = found[-1][:block]
+        if block <= 0 or any(each[: worlds * block] != worlds * first for worlds, each in enumerate(found, 1)):
             raise Irregular(f"{where} differs between the worlds")
-        return first * self._count + three[FEW * block :]
+        return first * self._count + found[-1][FEW * block :]
 
-    def _body_shapes(self, where: str, two: dict[int, list[int]], three: dict[int, list[int]]) -> _BodyShapes:
-        bodies = len(three) - len(two)
+    def _body_shapes(self, where: str, *found: dict[int, list[int]]) -> _BodyShapes:
+        three, bodies = found[-1], len(found[-1]) - len(found[-2])
         of_world = {body: three[body] for body in range(bodies)}
-        shapes = next((three[bodies + body][0] - found[0] for body, found in of_world.items() if found), 0)
+        shapes = next((three[bodies + body][0] - own[0] for body, own in of_world.items() if own), 0)
         if dict(_BodyShapes(of_world, FEW, shapes, three[-1])) != three:
             raise Irregular(f"{where} differs between the worlds")
-        of_none = self._rows(f"{where}[-1]", *(np.array(each[-1], np.int64) for each in (two, three))).tolist()
+        of_none = self._rows(f"{where}[-1]", *(np.array(each[-1], np.int64) for each in found)).tolist()
         return _BodyShapes(of_world, self._count, shapes, of_none)
 
 

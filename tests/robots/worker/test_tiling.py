@@ -139,20 +139,26 @@ def test_a_task_with_tiled_worlds_randomizes_renders_and_steps_as_one_with_world
     assert all(torch.equal(tiled[name], one_by_one[name]) for name in tiled)
 
 
-def test_a_scene_that_follows_no_rule_is_built_one_by_one_after_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("attribute", ["shape_color", "shape_collision_group"])
+def test_a_scene_that_follows_no_rule_is_built_one_by_one_after_a_warning(
+    attribute: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(tiling, "BY_NEWTON", 0)
 
     def scene(count: int) -> newton.ModelBuilder:
         world, builder = empty_builder(), empty_builder()
         world.add_shape_sphere(world.add_body(mass=1.0), radius=0.1)
         builder.replicate(world, count)
-        builder.add_shape_box(-1)  # its colour depends on the number of shapes
+        box = builder.add_shape_box(
+            -1, color=None if attribute == "shape_color" else (0, 0, 0)
+        )  # by the shape's number
+        builder.shape_collision_group[box] = count**2 if attribute == "shape_collision_group" else 1
         return builder
 
-    with pytest.warns(UserWarning, match=r"one by one, which takes long: model\.shape_color differs"):
+    with pytest.warns(UserWarning, match=rf"one by one, which takes long: model\.{attribute} differs"):
         model = tiling.tiled(scene, 4, "cpu")
     expected = scene(4).finalize(device="cpu")
-    np.testing.assert_array_equal(model.shape_color.numpy(), expected.shape_color.numpy())
+    np.testing.assert_array_equal(getattr(model, attribute).numpy(), getattr(expected, attribute).numpy())
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int32, np.float64])
