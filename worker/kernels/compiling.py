@@ -15,7 +15,7 @@ from typing import Any
 import warp as wp
 from warp._src import context
 
-from worker.kernels.listing import Kernels
+from worker.kernels.listing import KernelFile
 from worker.settings.errors import TrainingError
 
 ROOM = 2**26
@@ -63,23 +63,23 @@ def directory() -> Path:
     return Path(wp.config.kernel_cache_dir)
 
 
-def missing(kernels: Sequence[Kernels], device: str) -> list[Kernels]:
+def missing(kernels: Sequence[KernelFile], device: str) -> list[KernelFile]:
     """Those that the cache does not have for ``device``. What takes longest comes first."""
     found, cache = wp.get_device(device), directory()
 
-    def is_there(each: Kernels) -> bool:
+    def is_there(each: KernelFile) -> bool:
         binary = each.module._get_compile_output_name(found, block_dim=each.block_dim)
         return all((cache / each.name / file).exists() for file in (binary, f"{each.name}.meta"))
 
     return in_order([each for each in kernels if not is_there(each)])
 
 
-def in_order(kernels: Sequence[Kernels]) -> list[Kernels]:
+def in_order(kernels: Sequence[KernelFile]) -> list[KernelFile]:
     """First kernels with tiles, whose libraries are linked one after the other; then modules with many kernels."""
     return sorted(kernels, key=lambda each: (each.block_dim == 256, -len(each.module.kernels)))
 
 
-def load_all(kernels: Sequence[Kernels], device: str, workers: int, progress: Callable[[int, int], object]) -> None:
+def load_all(kernels: Sequence[KernelFile], device: str, workers: int, progress: Callable[[int, int], object]) -> None:
     """Compile kernels into the cache and load them, ``workers`` at a time.
 
     Kernels that don't compile are left out: their launch says why. Where the cache can't be written, no other will compile.
@@ -97,12 +97,12 @@ def load_all(kernels: Sequence[Kernels], device: str, workers: int, progress: Ca
 
 
 def compile_for(
-    kernels: Sequence[Kernels],
+    kernels: Sequence[KernelFile],
     target: str,
     cache: Path,
     workers: int,
     progress: Callable[[int, int], object] = lambda done, total: None,
-) -> list[tuple[Kernels, Exception]]:
+) -> list[tuple[KernelFile, Exception]]:
     """Compile kernels for a GPU that need not be there; what ``cache`` has is not compiled again.
 
     Args:
@@ -117,7 +117,7 @@ def compile_for(
     """
     is_ptx, arch = target.startswith("ptx"), int(target.lstrip("smptx"))
 
-    def one(each: Kernels) -> None:
+    def one(each: KernelFile) -> None:
         options = each.module.resolved_options[each.block_dim]
         each.module._compile(None, cache / each.name, None, arch, use_ptx=is_ptx, options=options)
 
@@ -125,10 +125,13 @@ def compile_for(
 
 
 def compile_all(
-    kernels: Sequence[Kernels], one: Callable[[Kernels], Any], workers: int, progress: Callable[[int, int], object]
-) -> list[tuple[Kernels, Exception]]:
+    kernels: Sequence[KernelFile],
+    one: Callable[[KernelFile], Any],
+    workers: int,
+    progress: Callable[[int, int], object],
+) -> list[tuple[KernelFile, Exception]]:
     """Call ``one`` for each of the kernels on threads; returns those for which it failed. Raises TrainingError, as :func:`load_all`."""
-    failed: list[tuple[Kernels, Exception]] = []
+    failed: list[tuple[KernelFile, Exception]] = []
     for each in kernels:
         each.module.get_module_hash(each.block_dim)  # names no file twice: hashes are of one thread's making
     with ThreadPoolExecutor(max(1, min(workers, len(kernels)))) as pool:

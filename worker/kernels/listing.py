@@ -27,7 +27,7 @@ from worker.settings.task import TaskConfig
 from worker.tasks.run.task import Task
 
 
-class Kernels(NamedTuple):
+class KernelFile(NamedTuple):
     """One Warp module, compiled for one size of thread blocks: a file in the cache."""
 
     module: Any
@@ -50,8 +50,8 @@ def kernels_of(
     has_picture: bool = False,
     for_gpu: bool = False,
     worlds: int = 2,
-    noted: Callable[[Kernels], object] = lambda _: None,
-) -> list[Kernels]:
+    noted: Callable[[KernelFile], object] = lambda _: None,
+) -> list[KernelFile]:
     """The kernels that the task launches, in the order of their first launch. Nothing is launched on the device.
 
     The global random generators are left as they were, and what the task prints or warns of is dropped: the real worlds say it again.
@@ -91,8 +91,8 @@ class _Captured(BaseException):
 class _Notes:
     """Stands for Warp's launches while it is taken."""
 
-    def __init__(self, device: str, for_gpu: bool, noted: Callable[[Kernels], object]) -> None:
-        self.found: dict[Kernels, None] = {}
+    def __init__(self, device: str, for_gpu: bool, noted: Callable[[KernelFile], object]) -> None:
+        self.found: dict[KernelFile, None] = {}
         self._device = wp.get_device(device)
         self._as_gpu = for_gpu or self._device.is_cuda
         self._noted = noted
@@ -146,7 +146,7 @@ class _Notes:
         return noted
 
     def _note(self, module: Any, block_dim: int) -> None:
-        kernels = Kernels(module, block_dim)
+        kernels = KernelFile(module, block_dim)
         self.found[kernels] = None
         if (name := f"{kernels.name} {block_dim}") not in self._names:
             self._names.add(name)
