@@ -20,6 +20,8 @@ from worker.settings.errors import TrainingError
 
 ROOM = 2**26
 """Free bytes without which a file system counts as full: the kernels of one task take up to 70 MB, with what the compiler leaves."""
+_PREFIX = "muster-kernels-"
+"""Of the name of a temporary cache."""
 _OTHER = "WARP_CACHE_PATH names another directory"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -35,6 +37,8 @@ def open_cache() -> tuple[Path, str]:
     """
     try:
         wp.init()
+        if _PREFIX in str(directory()):
+            return directory(), ""
         with tempfile.TemporaryFile(dir=directory()):
             pass
         if shutil.disk_usage(directory()).free < ROOM:
@@ -44,7 +48,7 @@ def open_cache() -> tuple[Path, str]:
         cache = Path(wp.config.kernel_cache_dir or error.filename or "")
         notice = f"the kernel cache {cache} can't be written ({error.strerror}): what it lacks is compiled for this run alone; {_OTHER}"
     try:
-        temporary = Path(tempfile.mkdtemp(prefix="muster-kernels-"))
+        temporary = Path(tempfile.mkdtemp(prefix=_PREFIX))
     except OSError as error:
         raise TrainingError(f"{notice}, and there is no temporary directory either ({error.strerror})") from None
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
@@ -67,11 +71,11 @@ def missing(kernels: Sequence[KernelFile], device: str) -> list[KernelFile]:
     """Those that the cache does not have for ``device``. What takes longest comes first."""
     found, cache = wp.get_device(device), directory()
 
-    def is_there(each: KernelFile) -> bool:
+    def is_cached(each: KernelFile) -> bool:
         binary = each.module._get_compile_output_name(found, block_dim=each.block_dim)
         return all((cache / each.name / file).exists() for file in (binary, f"{each.name}.meta"))
 
-    return in_order([each for each in kernels if not is_there(each)])
+    return in_order([each for each in kernels if not is_cached(each)])
 
 
 def in_order(kernels: Sequence[KernelFile]) -> list[KernelFile]:

@@ -87,7 +87,7 @@ def make(tasks: Sequence[str], targets: Sequence[str], build: Path) -> Path:
         ]
         if subprocess.run(command).returncode:
             raise UserError(f"the kernels of {task} are not complete; the lines above say why")
-    return _wheel(build, tasks, targets)
+    return pack(build, tasks, targets)
 
 
 def compile_task(task: str, targets: Sequence[str], build: Path) -> tuple[int, list[str]]:
@@ -174,7 +174,8 @@ def loaded_on_gpu(task: str) -> Listed:
     return list(found)
 
 
-def _wheel(build: Path, tasks: Sequence[str], targets: Sequence[str]) -> Path:
+def pack(build: Path, tasks: Sequence[str], targets: Sequence[str]) -> Path:
+    """Pack what :func:`compile_task` left in ``build`` for these tasks into a wheel, whose path is returned; the same files give the same bytes."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING

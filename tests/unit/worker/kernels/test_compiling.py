@@ -101,7 +101,7 @@ def as_nobody() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("reason", ["Permission denied", "No space left on device"])
-def test_a_cache_that_can_not_be_written_is_read_and_another_one_is_written(
+def test_a_cache_that_cannot_be_written_is_read_and_another_one_is_written(
     monkeypatch: pytest.MonkeyPatch, reason: str
 ) -> None:
     wp.init()
