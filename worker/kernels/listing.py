@@ -75,7 +75,7 @@ def kernels_of(
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), notes.taken():
             warnings.simplefilter("ignore")
             for module in algorithms:
-                wp.load_module(module, device)
+                notes.add(wp.get_module(module.__name__))
             task = _built(task_type, config, worlds, device, notes)
             if has_picture:
                 _draw(task)
@@ -144,6 +144,10 @@ class _Notes:
             return None
 
         return noted
+
+    def add(self, module: Any) -> None:
+        """Note a Warp module as if one of its kernels had been launched without a size of blocks."""
+        self._note(module, context._resolve_launch_block_dim(self._device, module.options["block_dim"]))
 
     def _note(self, module: Any, block_dim: int) -> None:
         kernels = KernelFile(module, block_dim)
