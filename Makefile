@@ -8,6 +8,7 @@
 # make bits            every proof that a resumed run ends with the same bits (make test has most of them)
 # make mutants          small faults in the pure modules: which ones do the unit tests not notice?
 # make cluster NODES=3 a controller, a Ray head and three workers in containers; make cluster-down
+# make kernels-pack      build/kernels/muster_kernels-….whl: compiled kernels for GPUs, which first trainings need not compile
 # make coverage TESTS=tests/unit   the branches of control, engines and learning that these tests never enter
 # make fuzz N=10000    malformed requests and hostile clients; no answer may be a 500, and others must be served meanwhile
 PYTHON ?= python3
@@ -18,7 +19,7 @@ READY  := $(VENV)/.ready
 # where it is set, every process would compile all that it imports anew: twice the time of a start
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: run race test check coverage unit integration training long robots services console engines quick rest without-racer kernels robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-health bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
+.PHONY: run race test check coverage unit integration training long robots services console engines quick rest without-racer kernels kernels-pack robots-kernels tracking lint format bench bench-gpu bench-api bench-scheduling bench-logs bench-health bench-resume bench-engines bench-startup bench-console bits fuzz mutants torture env image push cluster cluster-down clean
 
 run: $(READY)
 	$(BIN)/muster run job_specs/cartpole.yaml
@@ -88,6 +89,11 @@ coverage: $(READY) kernels
 # kept in the user's cache, for other clones and later runs
 kernels: $(READY)
 	$(BIN)/python -m tests.support.suite.kernels
+
+# a wheel of compiled kernels for GPUs, made without one; TASKS="Ant Humanoid" TARGETS=sm90 narrow it. Copied to containers/wheels,
+# it becomes part of the image
+kernels-pack: $(READY)
+	$(BIN)/python -m worker.kernels pack $(TASKS) $(if $(TARGETS),--targets $(TARGETS))
 
 robots-kernels: $(READY)
 	$(BIN)/python -m tests.support.suite.kernels Go1Flat G1Flat Go1Rough LiftCube LiftCubes

@@ -15,11 +15,13 @@ from typing import Any
 import warp as wp
 from warp._src import context
 
-from worker.kernels.listing import Kernels
+from worker.kernels.listing import KernelFile
 from worker.settings.errors import TrainingError
 
 ROOM = 2**26
 """Free bytes without which a file system counts as full: the kernels of one task take up to 70 MB, with what the compiler leaves."""
+_PREFIX = "muster-kernels-"
+"""Of the name of a temporary cache."""
 _OTHER = "WARP_CACHE_PATH names another directory"
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM)
 
@@ -35,6 +37,8 @@ def open_cache() -> tuple[Path, str]:
     """
     try:
         wp.init()
+        if _PREFIX in str(directory()):
+            return directory(), ""
         with tempfile.TemporaryFile(dir=directory()):
             pass
         if shutil.disk_usage(directory()).free < ROOM:
@@ -44,7 +48,7 @@ def open_cache() -> tuple[Path, str]:
         cache = Path(wp.config.kernel_cache_dir or error.filename or "")
         notice = f"the kernel cache {cache} can't be written ({error.strerror}): what it lacks is compiled for this run alone; {_OTHER}"
     try:
-        temporary = Path(tempfile.mkdtemp(prefix="muster-kernels-"))
+        temporary = Path(tempfile.mkdtemp(prefix=_PREFIX))
     except OSError as error:
         raise TrainingError(f"{notice}, and there is no temporary directory either ({error.strerror})") from None
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
@@ -63,23 +67,23 @@ def directory() -> Path:
     return Path(wp.config.kernel_cache_dir)
 
 
-def missing(kernels: Sequence[Kernels], device: str) -> list[Kernels]:
+def missing(kernels: Sequence[KernelFile], device: str) -> list[KernelFile]:
     """Those that the cache does not have for ``device``. What takes longest comes first."""
     found, cache = wp.get_device(device), directory()
 
-    def is_there(each: Kernels) -> bool:
+    def is_cached(each: KernelFile) -> bool:
         binary = each.module._get_compile_output_name(found, block_dim=each.block_dim)
         return all((cache / each.name / file).exists() for file in (binary, f"{each.name}.meta"))
 
-    return in_order([each for each in kernels if not is_there(each)])
+    return in_order([each for each in kernels if not is_cached(each)])
 
 
-def in_order(kernels: Sequence[Kernels]) -> list[Kernels]:
+def in_order(kernels: Sequence[KernelFile]) -> list[KernelFile]:
     """First kernels with tiles, whose libraries are linked one after the other; then modules with many kernels."""
     return sorted(kernels, key=lambda each: (each.block_dim == 256, -len(each.module.kernels)))
 
 
-def load_all(kernels: Sequence[Kernels], device: str, workers: int, progress: Callable[[int, int], object]) -> None:
+def load_all(kernels: Sequence[KernelFile], device: str, workers: int, progress: Callable[[int, int], object]) -> None:
     """Compile kernels into the cache and load them, ``workers`` at a time.
 
     Kernels that don't compile are left out: their launch says why. Where the cache can't be written, no other will compile.
@@ -97,12 +101,12 @@ def load_all(kernels: Sequence[Kernels], device: str, workers: int, progress: Ca
 
 
 def compile_for(
-    kernels: Sequence[Kernels],
+    kernels: Sequence[KernelFile],
     target: str,
     cache: Path,
     workers: int,
     progress: Callable[[int, int], object] = lambda done, total: None,
-) -> list[tuple[Kernels, Exception]]:
+) -> list[tuple[KernelFile, Exception]]:
     """Compile kernels for a GPU that need not be there; what ``cache`` has is not compiled again.
 
     Args:
@@ -117,7 +121,7 @@ def compile_for(
     """
     is_ptx, arch = target.startswith("ptx"), int(target.lstrip("smptx"))
 
-    def one(each: Kernels) -> None:
+    def one(each: KernelFile) -> None:
         options = each.module.resolved_options[each.block_dim]
         each.module._compile(None, cache / each.name, None, arch, use_ptx=is_ptx, options=options)
 
@@ -125,10 +129,13 @@ def compile_for(
 
 
 def compile_all(
-    kernels: Sequence[Kernels], one: Callable[[Kernels], Any], workers: int, progress: Callable[[int, int], object]
-) -> list[tuple[Kernels, Exception]]:
+    kernels: Sequence[KernelFile],
+    one: Callable[[KernelFile], Any],
+    workers: int,
+    progress: Callable[[int, int], object],
+) -> list[tuple[KernelFile, Exception]]:
     """Call ``one`` for each of the kernels on threads; returns those for which it failed. Raises TrainingError, as :func:`load_all`."""
-    failed: list[tuple[Kernels, Exception]] = []
+    failed: list[tuple[KernelFile, Exception]] = []
     for each in kernels:
         each.module.get_module_hash(each.block_dim)  # names no file twice: hashes are of one thread's making
     with ThreadPoolExecutor(max(1, min(workers, len(kernels)))) as pool:

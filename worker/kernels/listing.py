@@ -27,7 +27,7 @@ from worker.settings.task import TaskConfig
 from worker.tasks.run.task import Task
 
 
-class Kernels(NamedTuple):
+class KernelFile(NamedTuple):
     """One Warp module, compiled for one size of thread blocks: a file in the cache."""
 
     module: Any
@@ -50,8 +50,8 @@ def kernels_of(
     has_picture: bool = False,
     for_gpu: bool = False,
     worlds: int = 2,
-    noted: Callable[[Kernels], object] = lambda _: None,
-) -> list[Kernels]:
+    noted: Callable[[KernelFile], object] = lambda _: None,
+) -> list[KernelFile]:
     """The kernels that the task launches, in the order of their first launch. Nothing is launched on the device.
 
     The global random generators are left as they were, and what the task prints or warns of is dropped: the real worlds say it again.
@@ -75,7 +75,7 @@ def kernels_of(
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), notes.taken():
             warnings.simplefilter("ignore")
             for module in algorithms:
-                wp.load_module(module, device)
+                notes.add(wp.get_module(module.__name__))
             task = _built(task_type, config, worlds, device, notes)
             if has_picture:
                 _draw(task)
@@ -91,8 +91,8 @@ class _Captured(BaseException):
 class _Notes:
     """Stands for Warp's launches while it is taken."""
 
-    def __init__(self, device: str, for_gpu: bool, noted: Callable[[Kernels], object]) -> None:
-        self.found: dict[Kernels, None] = {}
+    def __init__(self, device: str, for_gpu: bool, noted: Callable[[KernelFile], object]) -> None:
+        self.found: dict[KernelFile, None] = {}
         self._device = wp.get_device(device)
         self._as_gpu = for_gpu or self._device.is_cuda
         self._noted = noted
@@ -145,8 +145,12 @@ class _Notes:
 
         return noted
 
+    def add(self, module: Any) -> None:
+        """Note a Warp module as if one of its kernels had been launched without a size of blocks."""
+        self._note(module, context._resolve_launch_block_dim(self._device, module.options["block_dim"]))
+
     def _note(self, module: Any, block_dim: int) -> None:
-        kernels = Kernels(module, block_dim)
+        kernels = KernelFile(module, block_dim)
         self.found[kernels] = None
         if (name := f"{kernels.name} {block_dim}") not in self._names:
             self._names.add(name)

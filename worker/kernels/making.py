@@ -87,7 +87,7 @@ def make(tasks: Sequence[str], targets: Sequence[str], build: Path) -> Path:
         ]
         if subprocess.run(command).returncode:
             raise UserError(f"the kernels of {task} are not complete; the lines above say why")
-    return _wheel(build, tasks, targets)
+    return pack(build, tasks, targets)
 
 
 def compile_task(task: str, targets: Sequence[str], build: Path) -> tuple[int, list[str]]:
@@ -101,7 +101,7 @@ def compile_task(task: str, targets: Sequence[str], build: Path) -> tuple[int, l
     import warp as wp
 
     from worker.kernels.compiling import compile_for, in_order
-    from worker.kernels.listing import Kernels, kernels_of
+    from worker.kernels.listing import KernelFile, kernels_of
     from worker.kernels.warm_start import cores, mark_of
     from worker.learning.algorithms import find_algorithm, installed
 
@@ -111,14 +111,14 @@ def compile_task(task: str, targets: Sequence[str], build: Path) -> tuple[int, l
     names: dict[str, None] = {}
     problems: list[str] = []
 
-    def compile_now(kernels: Sequence[Kernels]) -> None:
+    def compile_now(kernels: Sequence[KernelFile]) -> None:
         names.update(dict.fromkeys(each.name for each in kernels))
         for target, cache in caches.items():
             cache.mkdir(exist_ok=True)
             for each, error in compile_for(in_order(kernels), target, cache, cores()):
                 problems.append(f"{task}: {each.module.name} for {target}: {' '.join(str(error).split())[:300]}")
 
-    def noted(kernels: Kernels) -> None:
+    def noted(kernels: KernelFile) -> None:
         # the next overload of a generic kernel changes its module
         if any(each.is_generic for each in kernels.module.kernels.values()):
             compile_now([kernels])
@@ -174,7 +174,8 @@ def loaded_on_gpu(task: str) -> Listed:
     return list(found)
 
 
-def _wheel(build: Path, tasks: Sequence[str], targets: Sequence[str]) -> Path:
+def pack(build: Path, tasks: Sequence[str], targets: Sequence[str]) -> Path:
+    """Pack what :func:`compile_task` left in ``build`` for these tasks into a wheel, whose path is returned; the same files give the same bytes."""
     import warp as wp
 
     wp.config.log_level = wp.LOG_WARNING

@@ -41,11 +41,20 @@ def mark_of(task_type: type[Task], target: str) -> str:
     return f"wp_muster_{hashlib.sha256(repr(parts).encode()).hexdigest()[:16]}"
 
 
-def is_warm(task_type: type[Task], device: str) -> bool:
-    """Whether the cache has the kernels of a task, or an installed package brought them now; prints why a package can't be used."""
+def is_warm(task_type: type[Task], device: str, say: Callable[[str], object] = print) -> bool:
+    """Whether the cache has the kernels of a task, or an installed package brought them now.
+
+    Args:
+        task_type: The task.
+        device: ``"cpu"`` or ``"cuda:<n>"``.
+        say: Called with why the cache or a package can't be used, in a line.
+
+    Raises:
+        TrainingError: Kernels can't be written anywhere.
+    """
     cache, notice = compiling.open_cache()
     if notice:
-        print(f"warning: {notice}", flush=True)
+        say(f"warning: {notice}")
     if (cache / mark_of(task_type, target_of(device))).exists():
         return True
     if (folder := package.installed()) is None or device == "cpu":
@@ -53,13 +62,9 @@ def is_warm(task_type: type[Task], device: str) -> bool:
     gpu = package.Gpu(wp.get_device(device).arch, wp.get_cuda_driver_version() or (0, 0))
     try:
         target = package.unpack(folder, gpu, cache)
-    except package.Unfit as error:
-        print(f"{package.NAME} is not used: {error}; kernels are compiled", flush=True)
-        return False
-    except OSError as error:
-        print(
-            f"{package.NAME} is not used: {error.filename or cache}: {error.strerror}; kernels are compiled", flush=True
-        )
+    except (package.Unfit, OSError) as error:
+        reason = f"{error.filename or cache}: {error.strerror}" if isinstance(error, OSError) else error
+        say(f"{package.NAME} is not used: {reason}; kernels are compiled")
         return False
     if not (cache / mark_of(task_type, target)).exists():
         return False

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -57,7 +58,8 @@ def build_task(
     name = f"{task_type.__module__}:{task_type.__qualname__}"
     with user_errors(), task_mistakes(name):
         with gang.in_turn("task"):
-            if not is_warm(task_type, gang.device):
+            is_first = gang.placement.local_rank == 0  # of its node, whose others would print the same
+            if not is_warm(task_type, gang.device, partial(print, flush=True) if is_first else lambda _: None):
                 report = CompilerProgress(beacon, is_printed=gang.is_main)
                 compile_kernels(task_type, config, gang.device, cores(), report)
         if beacon is not None:

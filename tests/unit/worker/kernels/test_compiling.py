@@ -7,7 +7,9 @@ import resource
 import shutil
 import tempfile
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager, nullcontext
+from multiprocessing import get_context
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,7 +19,7 @@ import warp as wp
 
 from tests.support.worker.loop import alone
 from worker.kernels import compiling, package, warm_start
-from worker.kernels.listing import Kernels
+from worker.kernels.listing import KernelFile
 from worker.learning.algorithm import WorldShare
 from worker.learning.setup import build_task
 from worker.settings.errors import TrainingError, UserError
@@ -38,8 +40,8 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def small() -> list[Kernels]:
-    return [Kernels(doubled.module, 256)]
+def small() -> list[KernelFile]:
+    return [KernelFile(doubled.module, 256)]
 
 
 def test_a_kernel_is_compiled_for_gpus_that_are_not_there_where_warp_looks_for_it(cache: Path) -> None:
@@ -55,10 +57,24 @@ def test_a_kernel_is_compiled_for_gpus_that_are_not_there_where_warp_looks_for_i
 
 
 def test_only_what_the_cache_lacks_is_compiled_and_counted(cache: Path) -> None:
-    kernels, counts = [Kernels(doubled.module, 1)], []
+    kernels, counts = [KernelFile(doubled.module, 1)], []
     assert compiling.missing(kernels, "cpu") == kernels
     compiling.load_all(kernels, "cpu", 2, lambda done, total: counts.append((done, total)))
     assert counts == [(1, 1)] and not compiling.missing(kernels, "cpu")
+
+
+def compile_small(cache: Path) -> int:
+    """Body of a process: how many of the kernels failed."""
+    wp.init()
+    return len(compiling.compile_for([KernelFile(doubled.module, size) for size in (32, 64, 128)], "sm90", cache, 2))
+
+
+def test_processes_that_compile_into_one_cache_at_once_leave_whole_files(cache: Path) -> None:
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
+        assert list(pool.map(compile_small, [cache] * 2)) == [0, 0]
+    files = [each for each in cache.rglob("*") if each.is_file() and each.suffix != ".cu"]
+    assert sorted(each.suffix for each in files) == [".cubin"] * 3 + [".meta"] * 3
+    assert all(each.read_bytes()[:4] in (b"\x7fELF", b'{"do') for each in files)
 
 
 def test_a_full_file_system_ends_the_compilation_in_one_line(cache: Path) -> None:
@@ -85,7 +101,7 @@ def as_nobody() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("reason", ["Permission denied", "No space left on device"])
-def test_a_cache_that_can_not_be_written_is_read_and_another_one_is_written(
+def test_a_cache_that_cannot_be_written_is_read_and_another_one_is_written(
     monkeypatch: pytest.MonkeyPatch, reason: str
 ) -> None:
     wp.init()
