@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import sys
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from typing import Any
 
@@ -43,7 +43,7 @@ def follow(client: Client, job_id: str) -> int:
         return summary(client, job_id)
     display = _Bar(detail) if sys.stdout.isatty() else _Lines(detail)
     client.notify = display.note
-    seen = 0
+    seen, drawn = 0, False
     with display:
         while True:
             try:
@@ -60,10 +60,14 @@ def follow(client: Client, job_id: str) -> int:
             # not iterations before a resume
             records = [each for each in records if each["time"] * 1000 >= detail["createdAt"]]
             display.show(job, records[-1] if records else None)
+            if not drawn and phase_in(job) is Phase.DRAWING:  # nobody waits for a picture to see the rest
+                drawn = True
+                with suppress(Unreachable):
+                    show_facts(_facts(client.get(f"/api/jobs/{job_id}")), width=12)
             if has_ended:
                 break
             time.sleep(_POLL)
-    return summary(client, job_id)
+    return summary(client, job_id, ("picture", "run") if drawn else None)
 
 
 @contextmanager
@@ -105,36 +109,51 @@ def await_end(client: Client, job_id: str) -> int:
 
 def _ended(client: Client, job_id: str, err: bool) -> int:
     """0 of a job that SUCCEEDED, else its summary and the exit code of that."""
-    return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id, err)
+    return 0 if client.get(f"/api/jobs/{job_id}")["status"] == "SUCCEEDED" else summary(client, job_id, err=err)
 
 
-def summary(client: Client, job_id: str, err: bool = False) -> int:
-    """Print how a job ended and where its results are, or on standard error; returns the command's exit code."""
+def summary(client: Client, job_id: str, only: Collection[str] | None = None, *, err: bool = False) -> int:
+    """Print how a job ended and where its results are; returns the command's exit code.
+
+    Args:
+        client: The controller's.
+        job_id: Of the job.
+        only: Names of the facts of one that succeeded; None: all.
+        err: Whether it is printed on standard error.
+    """
     detail = client.get(f"/api/jobs/{job_id}")
     console = Console(highlight=False, soft_wrap=True, stderr=err)
     succeeded = detail["status"] == "SUCCEEDED"
     reason = "" if succeeded else f": {one_line(detail['statusReason'])}"
     status = (detail["status"], "green" if succeeded else "red")
     console.print(Text.assemble(status, f"  {reasons.named(detail['name'], detail['id'])}{reason}"))
-    results = detail["results"] or {}
     attempt = detail["attempts"][-1] if detail["attempts"] else None
     first = _cause(attempt) if attempt and not succeeded else None
     if first and first.get("error") and one_line(first["error"]) not in one_line(detail["statusReason"]):
         echo(f"  first error: node {first['index']}: {one_line(first['error'])}", err)
-    evaluation, best = results.get("evaluation"), describe_best(detail["run"], results.get("best"))
-    facts = {
-        "evaluation": in_one_line(evaluation) if succeeded and evaluation else "",
-        "best": best if succeeded else "",
-        "checkpoint": results.get("checkpoint"),
-        "log": (first or attempt["nodes"][0])["log"] if attempt else None,
-        **{name: results.get(name) for name in ("plot", "picture")},
-        "run": detail["run"],
-    }
-    show_facts(facts, width=12, err=err)
-    if not succeeded and results.get("checkpoint") and detail["kind"] == "train":
+    facts = _facts(detail, first)
+    if not succeeded:
+        facts |= {"evaluation": "", "best": ""}
+    shown = {name: fact for name, fact in facts.items() if not (succeeded and only) or name in only}
+    show_facts(shown, width=12, err=err)
+    if not succeeded and facts["checkpoint"] and detail["kind"] == "train":
         label = "once that is corrected:" if attempt and attempt.get("fault") else "continue with: "
         echo(f"  {label} muster resume {detail['run']}", err)
     return 0 if succeeded else 1
+
+
+def _facts(detail: Mapping[str, Any], cause: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    """The results of a job, and where they are. ``cause``: the node whose log tells why it failed."""
+    results, attempts = detail["results"] or {}, detail["attempts"]
+    evaluation = results.get("evaluation")
+    return {
+        "evaluation": in_one_line(evaluation) if evaluation else "",
+        "best": describe_best(detail["run"], results.get("best")),
+        "checkpoint": results.get("checkpoint"),
+        "log": (cause or attempts[-1]["nodes"][0])["log"] if attempts else None,
+        **{name: results.get(name) for name in ("plot", "picture")},
+        "run": detail["run"],
+    }
 
 
 def outcome(detail: Mapping[str, Any]) -> dict[str, Any]:

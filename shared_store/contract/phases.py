@@ -33,13 +33,13 @@ def phase_in(progress: Mapping[str, Any] | None) -> Phase | None:
         return None
 
 
-def kernels_in(progress: Mapping[str, Any] | None) -> str | None:
-    """How many kernels are compiled, of how many, in a node's progress: ``37/120``; None where it compiles none."""
-    count = (progress or {}).get("kernels")
-    is_count = isinstance(count, str) and re.fullmatch(r"\d{1,5}/\d{1,5}", count)
-    return count if is_count and phase_in(progress) is Phase.COMPILING else None
+def count_in(progress: Mapping[str, Any] | None) -> str | None:
+    """How far the phase in a node's progress is, such as ``37/120`` kernels; None where it does not count."""
+    count = (progress or {}).get("phase_count")
+    is_count = isinstance(count, str) and re.fullmatch(r"\d{1,7}/\d{1,7}", count)
+    return count if is_count and phase_in(progress) else None
 
 
 def shown_phase(progress: Mapping[str, Any] | None) -> str:
     """The phase in words for people: ``compiling kernels 37/120``; empty without one."""
-    return " ".join(filter(None, (phase_in(progress), kernels_in(progress))))
+    return " ".join(filter(None, (phase_in(progress), count_in(progress))))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
@@ -32,7 +33,8 @@ EVALUATED = 256
 class Drawing(Protocol):
     """Watches worlds while a policy is evaluated in them, and draws what it saw."""
 
-    def picture(self, config: TaskConfig) -> bytes: ...
+    def picture(self, config: TaskConfig, count: Callable[[int, int], None]) -> bytes:
+        """The drawing as PNG. ``count``: called with how much of it is done, and how much there is."""
 
 
 class FinalEvaluation(Hook):
@@ -46,17 +48,18 @@ class FinalEvaluation(Hook):
         self._draw = draw
 
     def trained(self, loop: Loop, checkpoint: str) -> None:
-        """Evaluate the policy, plot the curve, print the paths."""
+        """Evaluate the policy, plot the curve, print the paths; the picture comes last."""
         loop.say(f"evaluating checkpoint {checkpoint}")
-        loop.beacon.send(phase=Phase.EVALUATING)
+        loop.beacon.enter(Phase.EVALUATING)
         worlds = held_out_worlds(loop)
         drawing = self._draw(worlds) if self._draw and loop.gang.is_main else None
-        result = evaluate(worlds, loop.algorithm.policy(), loop.gang, checkpoint=checkpoint)
+        count = partial(loop.beacon.enter, Phase.EVALUATING)
+        result = evaluate(worlds, loop.algorithm.policy(), loop.gang, checkpoint=checkpoint, count=count)
         loop.say(str(result))
         if not loop.gang.is_main:
             return
         run, plot = loop.job.run, None
-        loop.beacon.send(phase=Phase.WRITING)
+        loop.beacon.enter(Phase.WRITING)
         try:
             result.write(run, iteration=loop.state.progress.iteration, config={})
             plot = plot_reward(run)
@@ -68,10 +71,10 @@ class FinalEvaluation(Hook):
         if plot:
             loop.say(f"reward plot: {plot}")
         if drawing:
-            loop.beacon.send(phase=Phase.DRAWING)
+            loop.beacon.enter(Phase.DRAWING)
             path = run.metrics / "policy.png"
             try:
-                write_atomic(path, drawing.picture(loop.config))
+                write_atomic(path, drawing.picture(loop.config, partial(loop.beacon.enter, Phase.DRAWING)))
                 loop.say(f"picture of the policy: {path}")
             except Exception as error:  # it does not fail the training
                 loop.say(f"warning: the picture of the policy could not be made ({type(error).__name__}: {error})")

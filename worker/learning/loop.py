@@ -121,7 +121,7 @@ class Loop:
         progress = self.state.progress
         self.say("\n".join(filter(None, [*self.task.notes(), self._beginning(), self._earlier_settings])))
         self._stopwatch.begin()
-        self.beacon.send(phase=Phase.TRAINING)
+        self.beacon.enter(Phase.TRAINING)
         try:
             for hook in self._hooks:
                 hook.begin(self)

@@ -154,7 +154,7 @@ def _warn(error: Exception) -> None:
 
 class Beacon:
     """Messages of a rank to its supervisor, one JSON line each on an inherited pipe: ``phase``
-    (:class:`shared_store.contract.phases.Phase`), ``kernels`` (of its compilation: ``37/120``), ``iteration`` and
+    (:class:`shared_store.contract.phases.Phase`), ``phase_count`` (how far it is: ``37/120``), ``iteration`` and
     ``steps_per_second``, ``message`` (of a save), ``done``.
 
     A message that finds the pipe full is dropped: the supervisor needs the newest, and the loop must not wait for it.
@@ -176,6 +176,10 @@ class Beacon:
         except OSError:
             self._descriptor = None  # the supervisor no longer listens
 
+    def enter(self, phase: Phase, done: int | None = None, total: int | None = None) -> None:
+        """Report the phase, and how much of it is done where it counts."""
+        self.send(phase=phase, phase_count=None if done is None else f"{done}/{total}")
+
 
 class CompilerProgress:
     """Reports how many kernels are compiled: to the supervisor each time, in the output now and then.
@@ -190,9 +194,8 @@ class CompilerProgress:
         self._printed = -_PRINTED_EVERY
 
     def __call__(self, done: int, total: int) -> None:
-        count = f"{done}/{total}"
         if self._beacon is not None:
-            self._beacon.send(phase=Phase.COMPILING, kernels=count)
+            self._beacon.enter(Phase.COMPILING, done, total)
         if self._is_printed and (done == total or time.monotonic() - self._printed >= _PRINTED_EVERY):
-            print(f"{Phase.COMPILING} {count}", flush=True)
+            print(f"{Phase.COMPILING} {done}/{total}", flush=True)
             self._printed = time.monotonic()

@@ -63,7 +63,7 @@ def build_task(
                 report = CompilerProgress(beacon, is_printed=gang.is_main)
                 compile_kernels(task_type, config, gang.device, cores(), report)
         if beacon is not None:
-            beacon.send(phase=Phase.BUILDING)
+            beacon.enter(Phase.BUILDING)
         return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
 
 

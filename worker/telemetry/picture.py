@@ -155,9 +155,9 @@ class EpisodePicture:
     def picture(
         self,
         config: TaskConfig,
+        count: Callable[[int, int], None] = lambda done, total: None,
         width: int = 320,
         height: int = 180,
-        count: Callable[[int, int], None] = lambda done, total: None,
     ) -> bytes:
         """:data:`MOMENTS` frames of that size as one PNG.
 

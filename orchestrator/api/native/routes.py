@@ -45,7 +45,7 @@ from orchestrator.services.chosen_checkpoints import CONFLICT
 from orchestrator.services.context import named_definition, queue_names
 from orchestrator.services.damaged_rows import reading
 from orchestrator.services.permissions import Actor, Operation
-from shared_store.contract.phases import kernels_in, phase_in
+from shared_store.contract.phases import count_in, phase_in
 from shared_store.volume.files import DamagedFile
 from shared_store.volume.layout import Run
 from shared_store.volume.log_view import Chosen, LogView
@@ -124,7 +124,7 @@ def job_detail(
 
     ``awsCode``: what the AWS Batch API states beyond ``statusReason``: AWS's code, or AWS's own words. ``ranSeconds``: how long all
     attempts ran, together. ``phase``: what a training does at present;
-    ``kernels``: how many it has compiled, of how many. ``children``: of an array, those that failed first.
+    ``phase_count``: how far that is, such as ``37/120`` kernels. ``children``: of an array, those that failed first.
     ``storeProblem``: why there are no results, where the store does not answer. ``runIsGone``: it was deleted;
     ``runIsReplaced``: another run has its name now.
     ``isOwn``: the caller has submitted it. ``withoutEffect``: members of its definition for Fargate, which change nothing here.
@@ -173,7 +173,7 @@ def job_detail(
                 "stoppedAt": job.stopped_at,
                 **job_list.ran(job.run_time),
                 "phase": phase_in(doing),
-                "kernels": kernels_in(doing),
+                "phase_count": count_in(doing),
                 "children": job_list.children_of(controller, session, job) if job.kind == "array" else None,
                 "nodes": len(gang.nodes),
                 "attempts": attempts,

@@ -81,7 +81,7 @@ def test_a_glance_shows_the_first_episode_of_an_evaluation_and_is_gone_after_it(
     task.reset()
     for _ in range(12):
         task.step(torch.ones(3, 1))
-    image = np.asarray(Image.open(io.BytesIO(preview.picture(CONFIG, 80, 60))))
+    image = np.asarray(Image.open(io.BytesIO(preview.picture(CONFIG, width=80, height=60))))
     assert image.shape == (122, 244, 3)
     tiles = [image[row : row + 60, column : column + 80] for row in (0, 62) for column in (0, 82, 164)]
     assert all(orange(tile).sum() > 30 and blue(tile).sum() > 30 for tile in tiles)

@@ -67,9 +67,9 @@ def test_plain_lines_count_compiled_kernels_at_intervals(
     monkeypatch.setattr("time.monotonic", lambda: now[0])
     lines = _Lines(DETAIL)
     for count in ("0/120", "1/120", "37/120", "37/120", "120/120"):
-        lines.show({**running("compiling kernels"), "kernels": count}, None)
+        lines.show({**running("compiling kernels"), "phase_count": count}, None)
         now[0] += 1.5
-    lines.show({**running("training"), "kernels": "120/120"}, None)
+    lines.show({**running("training"), "phase_count": None}, None)
     printed = capsys.readouterr().out.splitlines()[1:]
     assert printed == [*(f"compiling kernels {count}" for count in ("0/120", "37/120", "120/120")), "training"]
 

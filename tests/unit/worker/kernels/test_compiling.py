@@ -21,6 +21,7 @@ from tests.support.worker.loop import alone
 from worker.kernels import compiling, package, warm_start
 from worker.kernels.listing import KernelFile
 from worker.learning.algorithm import WorldShare
+from worker.learning.reporter import Beacon
 from worker.learning.setup import build_task
 from worker.settings.errors import TrainingError, UserError
 from worker.tasks import find_task
@@ -134,11 +135,12 @@ def test_the_cold_cache_of_a_task_is_filled_once_with_a_count(
         if not entry.name.startswith(("wp_muster_", "wp_worker.simulation.episodes_")):
             (cache / entry.name).symlink_to(entry)
     sent: list[dict[str, Any]] = []
-    beacon: Any = SimpleNamespace(send=lambda **message: sent.append(message))
+    beacon = Beacon({})
+    beacon.send = lambda **message: sent.append(message)  # type: ignore[method-assign]
     for _ in range(2):
         build_task(task_type, task_type.config_type(), WorldShare(0, 2, 2), alone(), 0, beacon)
-    counted = [{"phase": "compiling kernels", "kernels": count} for count in ("0/1", "1/1")]
-    assert sent == [*counted, {"phase": "building worlds"}, {"phase": "building worlds"}]
+    counted = [{"phase": "compiling kernels", "phase_count": count} for count in ("0/1", "1/1")]
+    assert sent == [*counted, *2 * [{"phase": "building worlds", "phase_count": None}]]
     assert capsys.readouterr().out == "compiling kernels 0/1\ncompiling kernels 1/1\n"
 
 
