@@ -96,7 +96,7 @@ def test_forked_and_started_ranks_end_with_the_same_bits(bench: TrainingBench) -
     same_bits(bench.store.path, "run", "run-2")
 
 
-def test_a_node_is_started_where_it_can_not_be_forked(bench: TrainingBench) -> None:
+def test_a_node_is_started_where_it_cannot_be_forked(bench: TrainingBench) -> None:
     """A library has read another value of a variable, the server has ended, or the program is another one."""
     server = ForkServer()
     fits = {**server._early, "MUSTER_RUN": "run", "CUDA_VISIBLE_DEVICES": "0"}
