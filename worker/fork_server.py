@@ -39,6 +39,7 @@ _IMPORTED = (
 def main(descriptor: str) -> int:
     """Import, then fork a node for each request. Returns at the end of the requests."""
     tether.follow(os.getppid())
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends it to the command's whole group
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # the engine learns of a shim's end by its file
     gc.disable()
     defer_imports()
@@ -48,7 +49,11 @@ def main(descriptor: str) -> int:
     channel = socket.socket(fileno=int(descriptor))
     channel.set_inheritable(False)
     while (request := receive(channel)) is not None:
-        message, (errors,) = request
+        message, descriptors = request
+        if "module" in message:
+            channel.close()
+            _become_program(message, descriptors)
+        (errors,) = descriptors
         pid = os.fork()
         if not pid:
             channel.close()
@@ -119,34 +124,53 @@ def _fork_rank() -> tuple[int, int]:
     return pid, own.detach()
 
 
+def _become_program(message: Mapping[str, Any], streams: Sequence[int]) -> NoReturn:
+    """Become a part of the worker that the command runs by itself: ``module`` with ``arguments`` and ``environment``, in ``directory``."""
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)
+    _run(message["module"], message["arguments"], message["environment"], message["directory"], streams)
+
+
 def _become_rank(message: Mapping[str, Any], descriptors: Sequence[int]) -> NoReturn:
-    """Become a rank: run ``module`` as a program, as a new interpreter would.
+    """Become a rank.
 
     Args:
         message: ``module``, its ``environment``, its ``directory`` (None: where this process is) and control ``group``.
         descriptors: Its standard streams, and that of its messages.
     """
     tether.enter(str(os.getppid()), "", message["group"])
+    *streams, progress = descriptors
+    environment = {**message["environment"], "MUSTER_PROGRESS_FD": str(progress)}
+    _run(message["module"], [], environment, message["directory"], streams)
+
+
+def _run(
+    module: str, arguments: Sequence[str], environment: Mapping[str, str], directory: str | None, streams: Sequence[int]
+) -> NoReturn:
+    """Run a module as a program, as a new interpreter would: with these variables, in this directory, with these standard streams."""
     # what the interpreter sets when it starts
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for number in (signal.SIGPIPE, signal.SIGXFSZ):
         signal.signal(number, signal.SIG_IGN)
-    *streams, progress = descriptors
     for target, source in enumerate(streams):
         os.dup2(source, target)
         os.close(source)
-    if message["directory"]:
-        os.chdir(message["directory"])
+    if directory:
+        os.chdir(directory)
     os.environ.clear()
-    os.environ.update(message["environment"], MUSTER_PROGRESS_FD=str(progress))
-    command = ["python", "-P", "-m", message["module"]]
+    os.environ.update(environment)
+    command = ["python", "-P", "-m", module, *arguments]
     _show(os.environ, command)
     import numpy
 
     numpy.random.seed()  # the state of its global generator was forked, too
-    sys.argv[1:], sys.orig_argv = [], command
-    runpy.run_module(message["module"], run_name="__main__", alter_sys=True)
-    os._exit(0)
+    sys.argv[1:], sys.orig_argv = arguments, command
+    code: Any = None
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as leaving:
+        code = leaving.code
+    sys.stdout.flush()
+    os._exit(code if isinstance(code, int) else bool(code))
 
 
 def _show(environment: Mapping[str, str], command: Sequence[str]) -> None:

@@ -7,6 +7,7 @@ import re
 import shutil
 import signal
 import sys
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,6 +23,8 @@ from orchestrator.cli.submitting import submit_spec
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, UsageError
+from orchestrator.engines.local.fork_server import prepared
+from orchestrator.home import muster_home
 from orchestrator.spec.model import Record, Render, Spec
 from orchestrator.spec.sections import Resources, Retry
 from shared_store.process.tether import start_tied
@@ -295,7 +298,16 @@ def run_worker(module: str, *arguments: str, run: str = "") -> int:
     store = {"MUSTER_STORE": str(Path(run).parents[1])} if run else {}
     ignored = [signal.SIGHUP] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else []  # nohup
     signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGTERM])  # until it can be passed on
-    started = start_tied([sys.executable, "-P", "-m", module, *arguments], ignored, env={**os.environ, **store})
+    environment = {"WARP_CACHE_PATH": str(muster_home() / "kernels"), **os.environ, **store}  # as jobs have it
+    started = None
+    if server := prepared():
+        with suppress(OSError):
+            if "--file" in arguments:  # which needs no simulation
+                server.close()
+            else:
+                started = server.become(module, arguments, environment)
+    if started is None:
+        started = start_tied([sys.executable, "-P", "-m", module, *arguments], ignored, env=environment)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the terminal sends Ctrl-C to both
     signal.signal(signal.SIGTERM, lambda *_: started.send_signal(signal.SIGINT))
     signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGTERM])

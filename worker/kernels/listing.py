@@ -15,6 +15,9 @@ from collections.abc import Callable, Iterator
 from types import ModuleType
 from typing import Any, NamedTuple
 
+import worker.simulation  # noqa: F401 - before Newton, whose kernels it keeps from having adjoints
+
+# isort: split
 import mujoco
 import newton
 import torch

@@ -108,7 +108,6 @@ class LocalEngine:
         for directory in {self._groups, self._memory}:
             remove_abandoned_groups(directory)
         self._ended: dict[str, GangStatus] = {}
-        self._fork_server = prepared()
         self._files = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
         """Limit of open files of what is started: the controller raises its own later, and select() knows no file above 1023."""
 
@@ -202,7 +201,7 @@ class LocalEngine:
     @contextmanager
     def _forks(self, nodes: Sequence[NodeProcess]) -> Iterator[ForkServer | None]:
         """Where the nodes of a gang can be forked: a server of its own is worth it where several ranks would import the same."""
-        server, self._fork_server = self._fork_server, None
+        server = prepared()
         with suppress(OSError):
             if server is None and sum(node.forkable for node in nodes) > 1:
                 server = ForkServer()

@@ -49,7 +49,6 @@ class ForkServer:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,
             )
 
     def fits(self, environment: Mapping[str, str]) -> bool:
@@ -83,6 +82,22 @@ class ForkServer:
         if answer is None:
             raise ConnectionResetError("the fork server has ended")
         return int(answer[0]["pid"])
+
+    def become(self, module: str, arguments: Sequence[str], environment: Mapping[str, str]) -> subprocess.Popen[bytes]:
+        """Have the server itself run a part of the worker, with this process's standard streams and directory; returns the process.
+
+        Raises:
+            OSError: The server has ended.
+        """
+        message = {
+            "module": module,
+            "arguments": [*arguments],
+            "environment": dict(environment),
+            "directory": os.getcwd(),
+        }
+        send(self._channel, message, (0, 1, 2))
+        self._channel.close()
+        return self._process
 
     def close(self) -> None:
         """End it. The nodes go on."""

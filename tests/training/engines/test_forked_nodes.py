@@ -107,7 +107,7 @@ def test_a_node_is_started_where_it_cannot_be_forked(bench: TrainingBench) -> No
     assert module_of(["python", "-m", "worker.train"]) is None and module_of(["sh", "-c", "echo", "a"]) is None
     assert early({"PATH": "/bin", "MUSTER_RUN": "a"}) == {"PATH": "/bin"}
     engine = bench.new_engine()
-    engine._fork_server = server
+    fork_server._prepared.append(server)
     handle = bench.launch(bench.training(1, 1), engine)
     assert [node.exit_code for node in bench.ended(handle, engine)] == [0]
 
