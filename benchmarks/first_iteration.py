@@ -27,6 +27,7 @@ from typing import Any
 
 MUSTER = str(Path(sys.executable).parent / "muster")
 _STARTED = re.compile(r"started in ([\d.]+) s: (.*)")
+_JOB = re.compile(r"(.+?):(\d+)(?::(\d+))?")
 _PART = re.compile(r"(.*) ([\d.]+) s")
 
 
@@ -90,8 +91,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as directory:
         home = Path(directory)
         for each in options.jobs:
-            task, worlds, *nodes = each.split(":")
-            count = int(nodes[0]) if nodes else 1
+            task, worlds, nodes = _JOB.fullmatch(each).groups()  # type: ignore[union-attr]
+            count = int(nodes or 1)
             job = spec(task, int(worlds), count, options.gpus)
             name = f"{task}, {int(worlds):,} worlds" + (f" on each of {count} nodes" if count > 1 else "")
             first = measured(home, job, options.picture)
