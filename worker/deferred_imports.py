@@ -175,6 +175,8 @@ class _Finder:
     @staticmethod
     def exec_module(module: types.ModuleType) -> None:
         """It waits for its first use."""
+        if module.__name__ == _META:  # without this part of it there are no generators
+            importlib.import_module("torch._prims.rng_prims")
 
 
 def defer_imports() -> None:

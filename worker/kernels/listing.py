@@ -25,6 +25,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 from warp._src import context
 
+from worker.kernels.common import Ahead
 from worker.learning.randomness import generator_state, restore_generators
 from worker.settings.task import TaskConfig
 from worker.tasks.run.task import Task
@@ -54,6 +55,7 @@ def kernels_of(
     for_gpu: bool = False,
     worlds: int = 2,
     noted: Callable[[KernelFile], object] = lambda _: None,
+    ahead: Ahead | None = None,
 ) -> list[KernelFile]:
     """The kernels that the task launches, in the order of their first launch. Nothing is launched on the device.
 
@@ -68,11 +70,12 @@ def kernels_of(
         for_gpu: Whether to list what a GPU would launch, on a machine without one.
         worlds: Number of worlds that are built; no kernel depends on it.
         noted: Called at each kernel's first launch, and again once another overload of a generic kernel is launched.
+        ahead: What is being compiled already.
 
     Raises:
         Exception: Whatever the task's own code raises.
     """
-    notes = _Notes(device, for_gpu, noted)
+    notes = _Notes(device, for_gpu, noted, ahead)
     state = generator_state()
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()), notes.taken():
@@ -94,11 +97,13 @@ class _Captured(BaseException):
 class _Notes:
     """Stands for Warp's launches while it is taken."""
 
-    def __init__(self, device: str, for_gpu: bool, noted: Callable[[KernelFile], object]) -> None:
+    def __init__(
+        self, device: str, for_gpu: bool, noted: Callable[[KernelFile], object], ahead: Ahead | None = None
+    ) -> None:
         self.found: dict[KernelFile, None] = {}
         self._device = wp.get_device(device)
         self._as_gpu = for_gpu or self._device.is_cuda
-        self._noted = noted
+        self._noted, self._ahead = noted, ahead
         self._names: set[str] = set()
         self._is_real = False
 
@@ -142,6 +147,8 @@ class _Notes:
 
         def noted(module: Any, device: Any, block_dim: int | None = None, *further: Any, **named: Any) -> Any:
             if self._is_real or wp.get_device(device) != self._device:
+                if self._ahead is not None:
+                    self._ahead.wait(module)
                 return load(module, device, block_dim, *further, **named)
             self._note(module, block_dim or module.options["block_dim"])
             return None

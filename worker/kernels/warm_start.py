@@ -12,6 +12,7 @@ from pathlib import Path
 import warp as wp
 
 from worker.kernels import compiling, package
+from worker.kernels.common import Ahead
 from worker.kernels.listing import kernels_of
 from worker.settings.task import TaskConfig
 from worker.tasks.run.task import Task
@@ -73,18 +74,37 @@ def is_warm(task_type: type[Task], device: str, say: Callable[[str], object] = p
     return True
 
 
-def compile_kernels(task_type: type[Task], config: TaskConfig, device: str, workers: int, progress: Progress) -> None:
+def compile_kernels(
+    task_type: type[Task],
+    config: TaskConfig,
+    device: str,
+    workers: int,
+    progress: Progress,
+    *,
+    has_picture: bool = False,
+) -> None:
     """Find the task's kernels and compile beside each other those that the cache does not have.
 
     A mistake in the task is not reported here: the real worlds meet it again.
 
+    Args:
+        task_type: The task.
+        config: Its configuration.
+        device: ``"cpu"`` or ``"cuda:<n>"``.
+        workers: Number of threads.
+        progress: Reports the count.
+        has_picture: Whether its policy is drawn in the end.
+
     Raises:
         TrainingError: The cache can't be written.
     """
+    ahead = Ahead(device, workers)  # what all tasks need, while this one is listed
     try:
-        kernels = kernels_of(task_type, config, device)
+        kernels = kernels_of(task_type, config, device, has_picture=has_picture, ahead=ahead)
     except Exception:
         return
+    finally:
+        ahead.close()
     if absent := compiling.missing(kernels, device):
         progress(0, len(absent))
         compiling.load_all(absent, device, workers, progress)

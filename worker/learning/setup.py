@@ -61,7 +61,8 @@ def build_task(
             is_first = gang.placement.local_rank == 0  # of its node, whose others would print the same
             if not is_warm(task_type, gang.device, partial(print, flush=True) if is_first else lambda _: None):
                 report = CompilerProgress(beacon, is_printed=gang.is_main)
-                compile_kernels(task_type, config, gang.device, cores(), report)
+                draws = os.environ.get("MUSTER_PICTURE") != "0"
+                compile_kernels(task_type, config, gang.device, cores(), report, has_picture=draws)
         if beacon is not None:
             beacon.enter(Phase.BUILDING)
         return task_type(config, share.count, seed=seed, first_world=share.first, device=gang.device)
