@@ -115,14 +115,38 @@ def unpack(folder: Path, gpu: Gpu, cache: Path) -> str:
         raise Unfit(f"{folder / entry['file']} was changed: its digest is not that of {MANIFEST}")
     unpacked = Path(tempfile.mkdtemp(prefix="wp_muster_unpacked_", dir=cache))
     try:
-        with tarfile.open(fileobj=io.BytesIO(data)) as archive:
-            archive.extractall(unpacked, filter="data")
-        for directory in sorted(unpacked.iterdir(), key=lambda each: each.name.startswith("wp_muster_")):
-            _move(directory, cache / directory.name)  # marks last
+        found = _read(data)
+        for name in sorted(found, key=lambda each: each.startswith("wp_muster_")):  # marks last
+            directory = unpacked / name
+            directory.mkdir()
+            for file, content in found[name].items():
+                (directory / file).write_bytes(content)
+            try:
+                directory.rename(cache / name)
+            except OSError:  # it is there, perhaps for other GPUs
+                _move(directory, cache / name)
         mark.mkdir(exist_ok=True)
     finally:
         shutil.rmtree(unpacked, ignore_errors=True)
     return target
+
+
+def _read(data: bytes) -> dict[str, dict[str, bytes]]:
+    """The directories in an archive, with their files. Extraction by ``tarfile`` takes three times as many calls of the system.
+
+    Raises:
+        Unfit: It has other things in it.
+    """
+    found: dict[str, dict[str, bytes]] = {}
+    with tarfile.open(fileobj=io.BytesIO(data)) as archive:
+        for member in archive:
+            parts = member.name.split("/")
+            if not parts[0].startswith("wp_") or ".." in parts or len(parts) > 2:
+                raise Unfit(f"its archive has an entry {member.name!r}")
+            files = found.setdefault(parts[0], {})
+            if content := archive.extractfile(member):
+                files[parts[-1]] = content.read()
+    return found
 
 
 def _move(source: Path, target: Path) -> None:
