@@ -16,7 +16,7 @@ def main() -> None:
     """Run the command. Ranks import for longer than the controller does: on a controller of its own, both import at the same time."""
     gc.set_threshold(50_000)  # imports make many objects, which stay
     if runs_job(sys.argv[1:]):
-        from orchestrator.engines.local.fork_server import prepare
+        from orchestrator.engines.local.forks import prepare
 
         prepare()
     from orchestrator.cli import main as run

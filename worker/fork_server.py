@@ -21,7 +21,7 @@ from typing import Any, NoReturn
 
 from shared_store.process import shim, tether
 from shared_store.process.forking import PADDING, RANKS, receive, send
-from worker.deferred_imports import defer_imports
+from worker.settings.deferred_imports import defer_imports
 
 _IMPORTED = (
     *(
@@ -45,8 +45,9 @@ def main(descriptor: str) -> int:
     defer_imports()
     for name in _IMPORTED:
         import_module(name)
-    if not os.path.exists("/dev/nvidiactl"):  # on a CPU the ranks of a gang start together: each would read the same functions
-        from worker.kernels.common import imported
+    # on a CPU the ranks of a gang start together, and each would read the same functions
+    if not os.path.exists("/dev/nvidiactl"):
+        from worker.kernels.ahead import imported
 
         for module in imported():
             module.get_module_hash(1)

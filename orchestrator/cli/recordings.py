@@ -23,7 +23,7 @@ from orchestrator.cli.submitting import submit_spec
 from orchestrator.cli.terminal import echo, echo_json
 from orchestrator.client import Client, named
 from orchestrator.domain.errors import ApiError, ServerError, UsageError
-from orchestrator.engines.local.fork_server import prepared
+from orchestrator.engines.local.forks import prepared
 from orchestrator.home import muster_home
 from orchestrator.spec.model import Record, Render, Spec
 from orchestrator.spec.sections import Resources, Retry

@@ -42,6 +42,7 @@ LAYERS = {
     "client": {"domain", "home"},
     "server": {"domain", "engines", "persistence", "control", "services", "api", "console", "home", "plugins"},
     "cli": {"domain", "spec", "engines", "control", "client", "home", "persistence", "server", "service_manager"},
+    "start": {"engines", "home", "cli"},
 }
 """What each room of the orchestrator may import beside itself."""
 ADAPTERS = {
@@ -165,7 +166,7 @@ WORKER_FLOORS = (
 )
 """Rooms of the worker, each of which imports those before it; modules at the root are entries."""
 ENTRIES_OF_WORKER = {
-    *("aws_node", "bitwise_diff", "checkpoint_writer", "evaluate", "export", "record", "render"),
+    *("aws_node", "bitwise_diff", "checkpoint_writer", "evaluate", "export", "fork_server", "record", "render"),
     *("repeat_incident", "robot", "slurm_node", "supervisor", "track", "train"),
 }
 STORE_FLOORS = ({"process"}, {"contract"}, {"volume"})

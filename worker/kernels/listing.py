@@ -25,7 +25,7 @@ import warp as wp
 from newton.solvers import SolverMuJoCo
 from warp._src import context
 
-from worker.kernels.common import Ahead
+from worker.kernels.ahead import Ahead
 from worker.learning.randomness import generator_state, restore_generators
 from worker.settings.task import TaskConfig
 from worker.tasks.run.task import Task

@@ -12,7 +12,7 @@ from pathlib import Path
 import warp as wp
 
 from worker.kernels import compiling, package
-from worker.kernels.common import Ahead
+from worker.kernels.ahead import Ahead
 from worker.kernels.listing import kernels_of
 from worker.settings.task import TaskConfig
 from worker.tasks.run.task import Task

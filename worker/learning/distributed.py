@@ -19,7 +19,7 @@ from datetime import timedelta
 import torch
 import torch.distributed as dist
 
-from worker.deferred_imports import defer_imports
+from worker.settings.deferred_imports import defer_imports
 from worker.settings.errors import GangError, UserError
 
 REPORT_SECONDS = 60.0

@@ -24,8 +24,8 @@ from shared_store.volume.checkpoints import DamagedCheckpoint, list_checkpoints
 from shared_store.volume.epoch import StaleEpoch
 from shared_store.volume.layout import Run, Store, StoreError
 from shared_store.volume.texts import TextError, resolved
-from worker.deferred_imports import defer_imports
 from worker.settings.accepted_changes import CHANGED_ROBOTS
+from worker.settings.deferred_imports import defer_imports
 from worker.settings.errors import GangError, TrainingError, UserError
 
 if TYPE_CHECKING:

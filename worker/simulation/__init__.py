@@ -2,7 +2,7 @@
 
 import warp as wp
 
-from worker.deferred_imports import defer_imports
+from worker.settings.deferred_imports import defer_imports
 from worker.simulation.registration import register_lazily
 
 # Set before the import of newton, which fixes the options of its kernels. Nothing here is differentiated, and backward passes would more

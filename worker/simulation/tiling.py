@@ -1,4 +1,4 @@
-"""A model of many equal worlds, made of Newton's own models of one, two and three of them."""
+"""The tiling of equal worlds: a model of many, made of Newton's own models of one, two and three of them."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ from orchestrator.engines.api import (
     unused_user,
 )
 from orchestrator.engines.local import TRAITS
-from orchestrator.engines.local.fork_server import ForkServer, prepared
+from orchestrator.engines.local.forks import ForkServer, prepared
 from orchestrator.engines.local.gangs import parent_of
 from orchestrator.engines.toolkit.environment import inherited, node_environment, supervised
 from orchestrator.engines.toolkit.gpus import visible_gpus

@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 from orchestrator.engines.api import Gang, Handle
-from orchestrator.engines.local import fork_server
+from orchestrator.engines.local import forks
 from orchestrator.engines.local.engine import LocalEngine
-from orchestrator.engines.local.fork_server import ForkServer
+from orchestrator.engines.local.forks import ForkServer
 from orchestrator.start import runs_job
 from shared_store.process.forking import early, module_of
 from shared_store.process.processes import marked
@@ -86,7 +86,7 @@ def test_what_is_killed_takes_the_forked_node_with_it(bench: TrainingBench, role
 def test_forked_and_started_ranks_end_with_the_same_bits(bench: TrainingBench) -> None:
     forked, started = bench.training(1, 10), bench.training(1, 10, suffix="-2", run="run-2")
     bench.store.run("run-2").create({"run": "run-2"})
-    fork_server.prepare()
+    forks.prepare()
     codes = []
     for engine, gang in ((bench.new_engine(), forked), (bench.engine, started)):
         handle = bench.launch(gang, engine)
@@ -107,7 +107,7 @@ def test_a_node_is_started_where_it_cannot_be_forked(bench: TrainingBench) -> No
     assert module_of(["python", "-m", "worker.train"]) is None and module_of(["sh", "-c", "echo", "a"]) is None
     assert early({"PATH": "/bin", "MUSTER_RUN": "a"}) == {"PATH": "/bin"}
     engine = bench.new_engine()
-    fork_server._prepared.append(server)
+    forks._prepared.append(server)
     handle = bench.launch(bench.training(1, 1), engine)
     assert [node.exit_code for node in bench.ended(handle, engine)] == [0]
 

@@ -10,7 +10,7 @@ from tests.support.worker.ranks import ROOT
 
 SCRIPT = """
 import sys
-from worker.deferred_imports import DEFERRED, _Deferred, _StandIn, defer_imports
+from worker.settings.deferred_imports import DEFERRED, _Deferred, _StandIn, defer_imports
 defer_imports()
 from worker.learning.distributed import RankPlacement, connect
 connect(RankPlacement(), device="cpu")

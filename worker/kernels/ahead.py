@@ -1,4 +1,4 @@
-"""The modules with kernels that every training with `ppo` loads: they are known before its task is."""
+"""Compiling ahead of a task the modules with kernels that every training with `ppo` loads."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ class Ahead:
     def __init__(self, device: str, workers: int) -> None:
         self._pool = ThreadPoolExecutor(workers)
         block_dim = context._resolve_launch_block_dim(wp.get_device(device), None)
-        self._begun: dict[Any, Future[Any]] = {}
+        self._loads: dict[Any, Future[Any]] = {}
         for module in imported():
             module.get_module_hash(block_dim)  # names no file twice: hashes are of one thread's making
-            self._begun[module] = self._pool.submit(module.load, device, block_dim)
+            self._loads[module] = self._pool.submit(module.load, device, block_dim)
 
     def wait(self, module: Any) -> None:
         """Wait for a module that is being compiled. A failure is left to its next load."""
-        if (begun := self._begun.get(module)) is not None:
+        if (load := self._loads.get(module)) is not None:
             with suppress(Exception):
-                begun.result()
+                load.result()
 
     def close(self) -> None:
         """Wait for all of them."""

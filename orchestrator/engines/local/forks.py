@@ -1,4 +1,4 @@
-"""A process that has imported what ranks import, from which the nodes of this machine are forked (:mod:`worker.fork_server`)."""
+"""Forks of a process that has imported what ranks import: nodes of this machine (:mod:`worker.fork_server`)."""
 
 from __future__ import annotations
 
