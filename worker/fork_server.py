@@ -45,12 +45,6 @@ def main(descriptor: str) -> int:
     defer_imports()
     for name in _IMPORTED:
         import_module(name)
-    # on a CPU the ranks of a gang start together, and each would read the same functions
-    if not os.path.exists("/dev/nvidiactl"):
-        from worker.kernels.ahead import imported
-
-        for module in imported():
-            module.get_module_hash(1)
     gc.freeze()
     channel = socket.socket(fileno=int(descriptor))
     channel.set_inheritable(False)

@@ -26,11 +26,6 @@ MODULES = (
 )
 
 
-def imported() -> list[Any]:
-    """Those of :data:`MODULES` that are imported, as Warp has them (``warp._src.context.Module``)."""
-    return [context.user_modules[name] for name in MODULES if name in context.user_modules]
-
-
 class Ahead:
     """Compiles and loads them on threads, from now on.
 
@@ -43,7 +38,7 @@ class Ahead:
         self._pool = ThreadPoolExecutor(workers)
         block_dim = context._resolve_launch_block_dim(wp.get_device(device), None)
         self._loads: dict[Any, Future[Any]] = {}
-        for module in imported():
+        for module in (context.user_modules[name] for name in MODULES if name in context.user_modules):
             module.get_module_hash(block_dim)  # names no file twice: hashes are of one thread's making
             self._loads[module] = self._pool.submit(module.load, device, block_dim)
 
