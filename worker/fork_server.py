@@ -24,12 +24,8 @@ from shared_store.process.forking import PADDING, RANKS, receive, send
 from worker.settings.deferred_imports import defer_imports
 
 _IMPORTED = (
-    *(
-        "worker.learning.distributed",
-        "worker.learning.leaving",
-        "worker.learning.memory_estimate",
-        "worker.learning.training",
-    ),
+    *("worker.learning.distributed", "worker.learning.leaving"),
+    *("worker.learning.memory_estimate", "worker.learning.training"),
     *("worker.tasks.library.cartpole", "worker.learning.ppo.fused", "worker.telemetry.tap"),
     *("worker.evaluation.final_evaluation", "worker.evaluation.episodes"),
 )
@@ -88,8 +84,7 @@ def _become_shim(message: Mapping[str, Any], errors: int) -> NoReturn:
     nothing = os.open(os.devnull, os.O_RDWR)
     for target, source in enumerate((nothing, nothing, errors)):
         os.dup2(source, target)
-    if message["directory"]:
-        os.chdir(message["directory"])
+    os.chdir(message["directory"])
     _, _, _, _, _, group, files, _, *supervisor = command
     me = os.getpid()
     pid = os.fork()
@@ -134,10 +129,9 @@ def _become_rank(message: Mapping[str, Any], descriptors: Sequence[int]) -> NoRe
     """Become a rank.
 
     Args:
-        message: ``module``, its ``environment``, its ``directory`` (None: where this process is) and control ``group``.
+        message: ``module``, its ``environment`` and its ``directory`` (None: where this process is).
         descriptors: Its standard streams, and that of its messages.
     """
-    tether.enter(str(os.getppid()), "", message["group"])
     *streams, progress = descriptors
     environment = {**message["environment"], "MUSTER_PROGRESS_FD": str(progress)}
     _run(message["module"], [], environment, message["directory"], streams)
@@ -176,7 +170,7 @@ def _run(
 def _show(environment: Mapping[str, str], command: Sequence[str]) -> None:
     """Show this process's command and variables in ``/proc``, where the kernel shows what the fork server was started with.
 
-    As many variables as have room over :data:`PADDING`, that by which processes of a node are found first.
+    It writes over :data:`PADDING`, as many variables as fit. The first is that by which a node's processes are found.
     """
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
     arguments, arguments_end, first, last = map(int, fields[45:49])  # arg_start to env_end in proc(5)

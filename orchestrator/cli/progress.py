@@ -60,7 +60,9 @@ def follow(client: Client, job_id: str) -> int:
             # not iterations before a resume
             records = [each for each in records if each["time"] * 1000 >= detail["createdAt"]]
             display.show(job, records[-1] if records else None)
-            if not drawn and phase_in(job) is Phase.DRAWING:  # nobody waits for a picture to see the rest
+            if (
+                not drawn and phase_in(job) is Phase.DRAWING
+            ):  # the other results are there, and need not wait for the picture
                 drawn = True
                 with suppress(Unreachable):
                     show_facts(_facts(client.get(f"/api/jobs/{job_id}")), width=12)

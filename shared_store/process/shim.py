@@ -26,7 +26,7 @@ SCRATCH = "muster-node-{pid}-"
 _PASSED_ON = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 _ORPHANED = signal.SIGUSR1
 """Signal from the kernel to the shim when the process that it is tied to dies."""
-FORKED = "MUSTERFORKED_SUPERVISOR"
+FORKED = "MUSTER_FORKED_SUPERVISOR"
 """Variable with the pid of a supervisor, a child, that is there already (:mod:`shared_store.process.forking`)."""
 _DIGITS = 3
 """Of an exit code."""

@@ -10,19 +10,12 @@ import warp as wp
 from warp._src import context
 
 MODULES = (
-    *(
-        "newton._src.solvers.mujoco.kernels",
-        "mujoco_warp._src.smooth",
-        "mujoco_warp._src.forward",
-    ),  # the largest ones first
+    # the largest ones first
+    *("newton._src.solvers.mujoco.kernels", "mujoco_warp._src.smooth", "mujoco_warp._src.forward"),
     *("mujoco_warp._src.derivative", "mujoco_warp._src.passive", "newton._src.geometry.bvh", "mujoco_warp._src.solver"),
     *("mujoco_warp._src.set_const", "mujoco_warp._src.support", "mujoco_warp._src.constraint"),
-    *(
-        "worker.simulation.episodes",
-        "worker.simulation.solver",
-        "worker.learning.ppo.draws",
-        "worker.learning.ppo.heads",
-    ),
+    *("worker.simulation.episodes", "worker.simulation.solver"),
+    *("worker.learning.ppo.draws", "worker.learning.ppo.heads"),
 )
 
 

@@ -52,7 +52,7 @@ def open_cache() -> tuple[Path, str]:
     try:
         temporary = Path(tempfile.mkdtemp(prefix=_PREFIX))
     except OSError as error:
-        raise TrainingError(f"{notice}, and there is no temporary directory either ({error.strerror})") from None
+        raise TrainingError(f"{notice}, and no temporary directory can be made ({error.strerror})") from None
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     wp.config.kernel_cache_dir = str(temporary)
     wp.init()  # Warp takes the directory as it is

@@ -37,7 +37,7 @@ def family(module: str) -> str:
 
 
 def kept(task: str) -> Listed | None:
-    """What a GPU loaded for a task with the present versions; None where nobody has listed it."""
+    """What a GPU loaded for a task with the installed versions; None if `shipped.json` does not have it."""
     document = json.loads(SHIPPED.read_text()) if SHIPPED.exists() else {}
     now = {name: version for name, version in versions().items() if name in document.get("versions", {})}
     if document.get("versions") != now or task not in document["tasks"]:

@@ -1,7 +1,7 @@
 """The package ``muster-kernels``: compiled kernels of Muster's tasks, checked and unpacked into Warp's cache.
 
-Its files are native code. Before one is used, its owner must be root or this user, nobody else may be able to write it, and its digest
-must be the manifest's. :mod:`worker.kernels.making` makes it.
+Its files are native code. A file is used only if root or this user owns it, other users can't write it, and its digest is that of the
+manifest. :mod:`worker.kernels.making` makes the package.
 """
 
 from __future__ import annotations
@@ -158,7 +158,7 @@ def _move(source: Path, target: Path) -> None:
 
 
 def _trusted(folder: Path, name: str) -> bytes:
-    """The bytes of a file that nobody else can have written. Raises Unfit."""
+    """The bytes of a file that other users can't write. Raises Unfit if they can."""
     path = folder / name
     try:
         with path.open("rb") as file:

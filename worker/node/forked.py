@@ -20,7 +20,6 @@ class ForkedRank:
         module: What it runs.
         environment: All its variables.
         directory: Its working directory; None: that of this process.
-        group: Directory of the control group that it enters; empty: none.
         progress: Descriptor to which it writes its messages.
     """
 
@@ -31,7 +30,6 @@ class ForkedRank:
         module: str,
         environment: Mapping[str, str],
         directory: Path | None,
-        group: str,
         progress: int,
     ) -> None:
         self.pid = pid
@@ -43,7 +41,6 @@ class ForkedRank:
             "module": module,
             "environment": dict(environment),
             "directory": directory and str(directory),
-            "group": group,
         }
         nothing = os.open(os.devnull, os.O_RDONLY)
         theirs = (nothing, theirs_out, theirs_err)

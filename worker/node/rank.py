@@ -125,8 +125,8 @@ class Rank:
         self.beacon, write_end = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._directory = directory
         module = module_of(command)
-        if forked is not None and module and not prefix:
-            self._process = ForkedRank(*forked, module, env, directory, group, write_end)
+        if forked is not None and module and not (prefix or group):
+            self._process = ForkedRank(*forked, module, env, directory, write_end)
         else:
             self._process = subprocess.Popen(
                 tied([*prefix, *command], group=group),

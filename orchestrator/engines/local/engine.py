@@ -233,7 +233,7 @@ class LocalEngine:
         group = f"{self._groups}/{_group_name(gang.name, index)}" if self._groups else ""
         mounts = mounts_of(gang.nodes[index].container, gang.store)
         command = with_mounts(supervised(node.command), mounts)
-        is_plain = not (mounts or gang.isolated or node.contract.user or node.contract.memory_group)
+        is_plain = not (mounts or gang.isolated or node.contract.user)  # only isolated ones have a memory group
         forkable = node.contract.ranks_per_node if is_plain and module_of(node.command) else 0
         exit_file = str(self._left(gang.name, index, "exit"))
         whole = shimmed(command, group, files=self._files, exit_file=exit_file)

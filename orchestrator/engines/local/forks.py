@@ -38,12 +38,12 @@ class ForkServer:
         environment = node_environment(inherited(), "", {}, {})
         self._early = early(environment)
         # one thread: those of a numerical library would not survive a fork, and a rank sets its own number
-        environment = {**environment, "OMP_NUM_THREADS": "1", **self._early, PADDING: "-" * _PADDING}
+        environment = {"OMP_NUM_THREADS": "1", **environment, "PYTHONUNBUFFERED": "1", PADDING: "-" * _PADDING}
         self._channel, theirs = socket.socketpair()
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-m", "worker.fork_server", str(theirs.fileno())],
-                env={**environment, "PYTHONUNBUFFERED": "1"},
+                env=environment,
                 cwd="/",
                 pass_fds=(theirs.fileno(),),
                 stdin=subprocess.DEVNULL,
